@@ -13,7 +13,7 @@ from typing import Any, cast
 
 from bench.errors import Unsupported, UserError, failure, printable
 from bench.experiment.experiment import Budget
-from bench.experiment.keys import COMPARED, SHARED, counted, fingerprint, hash_of_text, hashed, raised, revisions_of
+from bench.experiment.keys import COMPARED, SHARED, counted, fingerprint, hashed, raised, revisions_of
 from bench.experiment.parameters import labels
 from bench.experiment.reference_backends import capable_backends
 from bench.measure import descent, reference
@@ -41,10 +41,6 @@ DESCENDED = ("contact", "integrator", "backend")
 """The parts of the program that is descended, besides the scene of the cell, in the order of the setting ``path``."""
 _ranked: dict[str, tuple[Backend, ...]] = {}
 """Cache of the backends that can compute references, best first, by program key."""
-_program_keys: dict[tuple[str, ...], str] = {}
-"""Cache of the keys of programs, by all that decides them."""
-_rest: dict[tuple[Any, ...], tuple[str, str]] = {}
-"""Cache of what keys are hashes of apart from counts, as JSON before and after them, by all that decides it."""
 _reference_keys: dict[tuple[str, ...], str] = {}
 """Cache of the keys of references, by all that decides them."""
 
@@ -105,35 +101,25 @@ class Cell:
     @cached_property
     def key(self) -> str:
         """Hash of everything that decides the cell's numbers, except library versions, which have a column."""
-        parts = {axis: fingerprint(part) for axis, part in self.parts.items()}
-        counts = json.dumps([self.samples, self.repeats, self.seed, self.timing])
-        theta = "" if self.decision is OWN else repr((self.decision, self._path_key))
-        given = (*parts.items(), theta, repr(self.budget), fingerprint(self.study))
-        if given not in _rest:
-            own = None if self.budget is None else [self.reference_key, raised(revisions_of(COMPARED))]
-            # a study may use this backend besides the cell's own
-            best = fingerprint(next(iter(self.ranked_backends), None))
-            shared = raised(revisions_of(SHARED))
-            after = [
-                own,
-                best,
-                self.budget and counted(self.budget),
-                self._theta_hashed(),
-                fingerprint(self.study),
-                shared,
-            ]
-            _rest[given] = (json.dumps(parts), json.dumps(after)[1:])
-        before, rest = _rest[given]
-        return hash_of_text(f"[{before}, {counts}, {rest}")
+        own = None if self.budget is None else [self.reference_key, raised(revisions_of(COMPARED))]
+        # a study may use the best backend besides the cell's own
+        best = fingerprint(next(iter(self.ranked_backends), None))
+        return hashed(
+            {axis: fingerprint(part) for axis, part in self.parts.items()},
+            [self.samples, self.repeats, self.seed, self.timing],
+            own,
+            best,
+            self.budget and counted(self.budget),
+            self._theta_hashed(),
+            fingerprint(self.study),
+            raised(revisions_of(SHARED)),
+        )
 
     @cached_property
     def program_key(self) -> str:
         """Hash of everything that decides the program."""
         parts = [fingerprint(part) for part in (self.scene, self.contact, self.integrator)]
-        given = (*parts, repr((self.decision, self._path_key)))
-        if given not in _program_keys:
-            _program_keys[given] = hashed(parts, self._theta_hashed(), raised(revisions_of(SHARED)))
-        return _program_keys[given]
+        return hashed(parts, self._theta_hashed(), raised(revisions_of(SHARED)))
 
     @cached_property
     def descent_key(self) -> str:

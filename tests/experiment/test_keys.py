@@ -69,7 +69,7 @@ MOVED = {
 def forget():
     """Forget the hashes that keys are computed from."""
     keys.code_of.cache_clear()
-    own = (cell_module._ranked, cell_module._rest, cell_module._program_keys, cell_module._reference_keys)
+    own = (cell_module._ranked, cell_module._reference_keys)
     for cache in (keys._fingerprints, *own):
         cache.clear()
 
