@@ -25,7 +25,6 @@ WORKS, FAILS, OPEN, NO_RESULT = "works", "fails", "open", "no result"
 has no number."""
 NEAR = 2.0
 """A method whose error is more than this many times the lowest does not share the first place: the order is open."""
-EQUAL = "relative RMSE at equal rollouts"
 SAME_COST = 1.05
 """Costs within this factor count as equal: a call at w = 0 that all samples share makes 101 rollouts of 100."""
 FASTEST = 2.0
@@ -39,7 +38,6 @@ COLUMNS = (
     text("problem", "what distinguishes the problem from the others"),
     text("axis", "the swept quantity along which the problem is reported"),
     Column("at", "its value", format="setting"),
-    text("basis", "what is compared: the error at equal rollouts, or the cost of reaching an error"),
     Column(
         "rollouts",
         "rollouts of one estimate at which errors are compared; a gradient counts as the rollouts that take as long",
@@ -244,7 +242,7 @@ def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
     second = others.sort_values("same", kind="stable").drop_duplicates("setting").set_index("setting")
     tied = pd.concat([others[~(others["factor_low"] > 1)], lower]).groupby("setting", sort=False)["method"].agg(tuple)
     lines = methods.drop_duplicates("setting").set_index("setting")[["problem", "axis", "at", "rollouts"]].assign(
-        basis=EQUAL, not_comparable=missing, first=first["method"], **{name: first[error] for name, error in zip(VALUE, ERROR, strict=True)},
+        not_comparable=missing, first=first["method"], **{name: first[error] for name, error in zip(VALUE, ERROR, strict=True)},
         second=second["method"], **{name: second[name] for name in FACTOR}, tied=tied,
     )  # fmt: skip
     for name in ("tied", "not_comparable"):
