@@ -1,6 +1,5 @@
 """The study of errors: closed forms of descent, exclusions, ratios with their test over scenes, and a whole run."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -17,7 +16,6 @@ from trees import ROOT
 
 import bench
 from bench.experiment import config
-from bench.model import slopes
 
 PAPER = ROOT / "examples" / "cost_of_error"
 D = 8
@@ -59,18 +57,6 @@ def test_descent_along_a_rotated_gradient_takes_the_updates_of_its_closed_form(b
     assert search.updates == reachable
 
 
-def test_descent_with_relative_noise_has_the_mean_regret_of_its_closed_form(bowl):
-    """E f falls by (1 - s)^2 + (s e)^2 per step for noise of relative size e."""
-    share, noise, steps, seeds = 0.4, 0.8, 6, 400
-    method = Method(GradientDescent(rate=share / curvature(bowl)), Planted(base="best", noise=noise), 4)
-    task = dataclasses.replace(task_of(bowl, steps), optimum=-1e9)  # no target is reached
-    paths = [follow(bowl, method, task, seed, keep=True).thetas for seed in range(seeds)]
-    squares = np.array([[theta @ theta for theta in path] for path in paths])
-    ratio = squares[:, -1] / squares[:, 0]
-    factor = (1 - share) ** 2 + (share * noise) ** 2
-    assert ratio.mean() == pytest.approx(factor**steps, abs=4 * ratio.std() / math.sqrt(seeds))
-
-
 def test_with_random_starts_the_best_gradient_is_that_of_the_scored_cost():
     """Both are means over the same fixed starts, so that differences of the cost give the gradient, and no noise remains."""
     scene = CartpoleSwing(horizon=6, noise="parameter", sigma=0.05, policy="mlp[hidden=2]")
@@ -102,12 +88,6 @@ def test_tuning_finds_the_rate_that_solves_a_quadratic_in_one_step(bowl):
     assert found.updates[found.best[-1]].tolist() == [1.0] * len(TARGETS)
 
 
-def test_unit_rate_makes_the_first_step_one(bowl):
-    gradient = np.linspace(-3.0, 2.0, D)
-    assert unit_rate(GradientDescent(), gradient) == pytest.approx(1 / 3)
-    assert unit_rate(Adam(), gradient) == pytest.approx(1.0, rel=1e-6)
-
-
 def test_searches_in_shared_calls_equal_separate_searches(bowl):
     methods = [Method(Adam(rate=r), Planted(base="best", noise=1.0), 2) for r in (0.1, 0.5)]
     task = task_of(bowl, 40)
@@ -121,14 +101,6 @@ def test_the_error_of_one_of_the_searches_that_share_calls_is_raised(bowl):
     searches = [lambda lane, width=width: lane.value(np.zeros(lane.dim), np.zeros((width, 1))) for width in widths]
     with pytest.raises(bench.UserError, match=r"noise w has the shape \(9, 1\)"):
         run_batched(bowl, searches)
-
-
-def test_step_jacobians_of_searches_that_share_batches():
-    """Without step Jacobians of the backend they are differences, in a shared problem too."""
-    problem = bench.problem("lqr[horizon=5]", backend="numpy")
-    theta, still = np.ones(5), np.zeros((5, 1))
-    (shared,) = run_batched(problem, [lambda lane: slopes(lane, theta, still).a])
-    assert np.array_equal(shared, slopes(problem, theta, still).a)
 
 
 def test_compare_splits_the_error_into_bias_and_spread():

@@ -11,7 +11,6 @@ from bench.plugins.optimizers.gauss_newton import GaussNewton
 from bench.plugins.studies.identify import views as shown
 from bench.plugins.studies.identify.measure import (
     Fitting,
-    count_windows,
     information,
     missing_terms,
     model_of,
@@ -22,7 +21,6 @@ from helpers import loaded, stored, unmeasured
 from scipy.integrate import solve_ivp
 
 import bench
-from bench.cli import main
 from bench.errors import Unsupported
 from bench.experiment import config
 from bench.measure import adequacy
@@ -102,21 +100,6 @@ def test_words_of_products():
     assert Information(names, np.diag([1.0, 1.0, 0.0])[:2]).labels == ["a", "b"]  # c moves nothing
 
 
-def test_friction_fitted_with_a_step_holds_for_that_step():
-    """d = v0^2/(2 mu g) = 1.529052, dd/dmu = -5.096840, and mu_hat/mu = 1 - h mu g/v0."""
-    exact, model = 9.0 / (2 * 0.3 * 9.81), model_of(cell_of("scenes=[sliding_block]"))
-    assert exact == pytest.approx(1.529052, rel=1e-6)
-    assert -exact / 0.3 == pytest.approx(-5.096840, rel=1e-6)
-    fitting = Fitting(model, "single", 1, 0.01)
-    found = np.exp(run_fits(fitting, GaussNewton(), np.log([[0.25]]), np.array([[exact]]), 40)[0])[0, 0]
-    # the stop within a step leaves a second-order rest
-    assert found / 0.3 == pytest.approx(1 - 0.02 * 0.3 * 9.81 / 3.0, abs=2e-3)
-    fine = model_of(cell_of("scenes=[sliding_block[dt=0.0005,horizon=2400]]"))
-    assert (fine.record(np.array([[0.3 * 1.001, 0.3 * 0.999]])) @ [1, -1]) / 0.0006 == pytest.approx(
-        [-5.09684], rel=0.01
-    )
-
-
 @pytest.mark.slow
 def test_a_row_in_all_ways():
     row = row_of("scenes=[mass_spring_damper[horizon=80]]", "integrators=[rk4]", "repeats=12")
@@ -133,15 +116,6 @@ def test_model_of_a_coarse_step_says_so():
     row = row_of("study=identify[refine=16]", "scenes=[sliding_block]", "repeats=16")
     assert row["step_shift_bound"] > shown.MAX_STEP_SHIFT
     assert row["coverage_high"][0] < 0.95
-
-
-@pytest.mark.slow
-def test_cramer_rao_is_reached_over_500_records_and_none_hides_the_gauge():
-    row = row_of("study=identify[windows=2]", *SPRING, "repeats=500")
-    assert row["hidden"][0] == 0
-    # the relative error of a standard deviation from 500 draws of two numbers
-    assert abs(row["error"][0] - 1.0) < 4 / math.sqrt(2 * 1000)
-    assert row["coverage_low"][0] < 0.95 < row["coverage_high"][0]
 
 
 def refused(*words):
@@ -255,26 +229,6 @@ def test_irregular_times_are_resampled_and_starts_and_zeros_are_fitted(tmp_path)
     assert row["estimate_low"][0] == pytest.approx(2 * row["estimate"][0] - row["estimate_high"][0])
 
 
-@pytest.mark.slow
-def test_a_pendulum_with_dry_friction_from_a_csv(tmp_path, capsys):
-    """The estimate is on the first screen, with the bias that friction can cause."""
-    words = [
-        f"study=identify[{pendulum(tmp_path, 0.02, drag=0.04615)},state={{q0: 1}}]",
-        *SWING[1:2],
-        "backends=[numpy]",
-    ]
-    words += ["theta=[mass,damping]", "scenes=[pendulum[torque=0,damping=0.01,horizon=300]]", f"results_dir={tmp_path}"]
-    assert main(words) == 0
-    lines = capsys.readouterr().out.splitlines()
-    estimate = next(line for line in lines[:12] if line.startswith("damping/mass"))
-    value, low, high, bias = map(float, estimate.split()[1:5])
-    truth = 0.04615 * 0.25
-    assert low < value < high < low + 0.1 * value
-    assert truth < low  # the friction looks like damping
-    (friction,) = [line.split() for line in lines if line.startswith("damping/mass  dry friction of q0")]
-    assert bias >= float(friction[5]) > value - truth
-
-
 def test_missing_terms_are_the_derivatives_of_the_record_by_them():
     model = wrong_models.PAIRS["pendulum"]
     theta = model.values
@@ -361,10 +315,6 @@ def test_fits_take_gauss_newton_unless_another_optimizer_is_named():
         (["study=optimise"], "adam"),
     ):
         assert [str(choice) for choice in config.load([*words, *SPRING]).choices["optimizer"]] == [chosen]
-
-
-def test_number_of_windows():
-    assert [count_windows(horizon, 8) for horizon in (200, 7, 12, 1)] == [8, 1, 6, 1]
 
 
 # ------------------------------------------------------------------------------------- models that do not explain

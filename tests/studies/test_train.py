@@ -139,12 +139,6 @@ def test_a_return_above_another_by_less_than_noise_is_not_behind():
     assert studied.ranked(lines.assign(returns=[best - 1.9, best]), ["group"]).tolist() == ["behind", "first"]
 
 
-def test_rows_without_a_run_show_their_reasons():
-    experiment, rows = made_up(status="error", reason="planted", curve_return=[])
-    shown = experiment.study.views(experiment, rows)
-    assert shown.remarks == ["15 error: planted"]
-
-
 @pytest.mark.parametrize(
     ("scene", "backend", "message"),
     [
