@@ -7,14 +7,11 @@ import numpy as np
 import pandas as pd
 import pytest
 import wrong_models
-from bench.plugins.optimizers.gauss_newton import GaussNewton
 from bench.plugins.studies.identify import views as shown
 from bench.plugins.studies.identify.measure import (
-    Fitting,
     information,
     missing_terms,
     model_of,
-    run_fits,
 )
 from bench.plugins.studies.identify.record import evaluate
 from helpers import loaded, stored, unmeasured
@@ -25,7 +22,6 @@ from bench.errors import Unsupported
 from bench.experiment import config
 from bench.measure import adequacy
 from bench.measure.identification import Information, product
-from bench.model import Answer
 
 SPRING = ("scenes=[mass_spring_damper]", "integrators=[rk4]")
 FORCED = ("scenes=[mass_spring_damper[force=0.5]]", "integrators=[rk4]")
@@ -57,23 +53,6 @@ def displacement(k, c, t):
     a = c / 2
     w = np.sqrt(k - a * a)
     return np.exp(-a * t) * (np.cos(w * t) + a / w * np.sin(w * t))
-
-
-def closed_form_fisher():
-    """Fisher matrix of (k/m, c/m) for 200 samples to T = 10 with noise .01, from the closed form of the motion."""
-    t, h = 0.05 * np.arange(1, 201), 1e-6
-    by_k = (displacement(4 + h, 0.4, t) - displacement(4 - h, 0.4, t)) / (2 * h)
-    by_c = (displacement(4, 0.4 + h, t) - displacement(4, 0.4 - h, t)) / (2 * h)
-    rows = np.stack([by_k, by_c]) / 0.01
-    return rows @ rows.T
-
-
-def test_information_is_that_of_the_closed_form():
-    found = known(*SPRING, "theta=[stiffness,damping]")
-    scale = np.array([4.0, 0.4])  # logarithms
-    assert found.jacobian.T @ found.jacobian == pytest.approx(
-        closed_form_fisher() * np.outer(scale, scale), rel=STEPPED
-    )
 
 
 @pytest.mark.parametrize(
@@ -288,25 +267,6 @@ def test_a_parameter_that_moves_nothing_has_no_interval():
     assert estimates.loc["stiffness", "identifiable"] == "yes"
 
 
-def test_fits_stop_where_they_have_converged():
-    model = model_of(cell_of(*SPRING, "theta=[stiffness,damping]"))
-    data = model.record(model.values[:, None]) + 0.01 * np.random.default_rng(3).standard_normal((200, 1))
-    fitting, calls = Fitting(model, "single", 1, 0.01), []
-
-    class Counting(GaussNewton):
-        def ask(self, state, noise):
-            calls.append(1)
-            return super().ask(state, noise)
-
-    start = fitting.start(1.2 * model.values[:, None], data)
-    found, has_converged = run_fits(fitting, Counting(), start, data, 40)
-    assert has_converged.all()
-    assert len(calls) < 15
-    exact, _ = run_fits(fitting, GaussNewton(), found, data, 40)
-    errors = information(model, model.values, 0.01).bound
-    assert (np.abs(found - exact)[:, 0] < 1e-3 * errors).all()
-
-
 def test_fits_take_gauss_newton_unless_another_optimizer_is_named():
     """A record of one's own, fitted by the default of other studies, ended elsewhere and the model was blamed."""
     for words, chosen in (
@@ -392,20 +352,6 @@ def test_a_missing_term_of_the_stated_reach_is_noticed_at_the_stated_power():
     data = without(line, noise + first.reach["cubic"] * term["cubic"][:, None])
     noticed = np.mean([not adequacy.judge(data[:, i], line, 1, term, i).is_explained for i in range(40)])
     assert noticed >= adequacy.POWER - 0.1  # three standard errors
-
-
-def test_levenberg_marquardt_needs_as_few_evaluations_as_minpack_on_rosenbrock():
-    """SciPy's needs 21; the rule that changed the damping tenfold needed 44."""
-    optimizer, evaluations = GaussNewton(), 0
-    state = optimizer.start(np.array([-1.2, 1.0]))
-    while True:
-        x = optimizer.ask(state, np.empty((2, 0)))
-        residual = np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]])
-        jacobian = np.array([[-20 * x[0, 0], 10.0], [-1.0, 0.0]])[:, :, None]
-        state, evaluations = optimizer.tell(state, x, Answer(residual=residual, jacobian=jacobian)), evaluations + 1
-        if 0.5 * float((residual**2).sum()) < 1e-20:
-            break
-    assert evaluations <= 21
 
 
 # ---------------------------------------------------------------------------------------------------- what is shown

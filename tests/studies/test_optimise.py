@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 from bench.plugins.studies.optimise import views as studied
 from bench.plugins.studies.optimise.measure import scene_class
-from classes import ExplicitEuler, Impulse, Lqr, Penalty, SemiImplicitEuler, StaticGain, TwoBalls
-from helpers import loaded, stored
+from classes import ExplicitEuler, Impulse, Lqr, Penalty, SemiImplicitEuler, TwoBalls
+from helpers import loaded
 
 import bench
 from bench.cli import main
@@ -42,18 +42,6 @@ def test_regulator_knows_its_optimum_and_value():
         assert scene.cost_to_go(path[step, :1, None], path[step, 1:, None], step)[0] == pytest.approx(
             sum(rest), rel=CHECKED
         )
-
-
-def test_scalar_regulator():
-    """A = B = Q = 1, R = .1, Q_f = 10, T = 10: J* 1.0916079783, J(0) 20, and 100 copies of it with one constant gain."""
-    scene = StaticGain(copies=1)
-    assert scene.cost_to_go(np.zeros((1, 1)), np.ones((1, 1)), 0)[0] == pytest.approx(1.0916079783, rel=1e-9)
-    assert StaticGain(copies=100).optimum(None, None)[0] == pytest.approx(109.1607978, rel=1e-9)
-    problem = bench.problem("static_gain[copies=3]", backend="numpy")
-    costs = problem.value(
-        np.stack([np.zeros(9), np.full(9, -0.9160798 / 3), -0.9160798 * np.eye(3).ravel()], axis=1), np.zeros((9, 3))
-    )
-    assert costs == pytest.approx([60.0, 3.274823934, 3.274823934], rel=1e-8)  # every K with K 1 = -.9160798
 
 
 def test_two_balls():
@@ -201,17 +189,6 @@ def test_interquartile_mean_by_hand():
     assert performance.interquartile_mean(np.arange(8.0)) == pytest.approx(3.5)
 
 
-def test_bootstrap_interval_of_a_mean_covers():
-    rng = np.random.default_rng(1)
-    hits = 0
-    for seed in range(200):
-        low, high = performance.bootstrap(
-            [rng.standard_normal(30) + 1.0], lambda parts: float(parts[0].mean()), seed, 200
-        )
-        hits += low <= 1.0 <= high
-    assert hits / 200 > 0.88
-
-
 def searches(finals):
     """One problem's searches: final costs by method and tuning, one for each seed."""
     rows = [
@@ -257,25 +234,6 @@ def test_a_method_beats_the_baseline_in_the_share_of_pairs_that_it_wins():
 
 
 # ---------------------------------------------------------------------------------------------------- what is shown
-
-
-@pytest.fixture(scope="module")
-def standard():
-    """The rows of the smallest standard experiment, and its views."""
-    given, rows = stored("optimise/small")
-    return rows, study_of(given).views(given, rows)
-
-
-def test_charts_have_the_tables_numbers(standard):
-    """The dots are the summary's shares, and the lines of runtimes end at them."""
-    rows, views = standard
-    charts = {chart.name: chart for chart in views.charts}
-    assert next(iter(charts)) == "targets"
-    shares = charts["targets"].frame.set_index("method")["reached"]
-    assert list(shares) == sorted(shares, reverse=True)
-    ends = charts["runtimes"].frame.groupby("method")["share"].max()
-    assert ends.to_dict() == pytest.approx(shares.to_dict())
-    assert len(views.rows) == len(rows)
 
 
 def raced(rates, scenes):

@@ -1,9 +1,7 @@
 """What studies show of rows: nothing is folded that has parameters of its own, and every row says how to make it again."""
 
-import ast
 import re
 import shlex
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +10,6 @@ from bench.plugins.studies.stability import cells_of
 from bench.plugins.studies.twins import FLOOR
 from helpers import unmeasured
 
-import bench.report
 from bench.experiment import config
 from bench.experiment.axes import table
 from bench.experiment.columns import COMMON
@@ -192,17 +189,6 @@ def test_a_study_without_a_page_gets_its_numbers_and_filters_by_what_varies(own)
     assert [(chart.x[0].name, chart.y[0].heading) for chart in views.charts] == [("mass", "weight [kg]")]
     assert data["filters"] == ["mass", "outcome"]
     assert data["cells"]["mass"] == [1, 2, 3]
-
-
-def test_reports_name_no_plugin():
-    """Neither study nor plugin: what a report has to know of one it asks it."""
-    every = (entry for found in registry.entries().values() for entry in found.values() if entry.plugin)
-    names = {entry.name for entry in every if entry.plugin.__module__.startswith("bench.")}
-    here = Path(bench.report.__file__).parent
-    for path in here.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Constant) and isinstance(node.value, str):
-                assert node.value not in names, f"{path.name}, line {node.lineno}"
 
 
 # ---------------------------------------------------------------------------------------------------------- again

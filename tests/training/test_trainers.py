@@ -82,11 +82,7 @@ def test_the_first_step_of_sep_cma_es_is_the_diagonal_of_that_of_cma_es():
 
 WRONG = {
     "none": lambda g: g,
-    "sign": lambda g: -g,
-    "ten times": lambda g: 10.0 * g,
-    "noise": lambda g: jnp.linalg.norm(g) / g.size**0.5 * jax.random.normal(jax.random.PRNGKey(0), g.shape),
     "half of the units": lambda g: g.at[::2].set(0.0),
-    "nothing": jnp.zeros_like,
 }
 
 
@@ -104,9 +100,7 @@ class Planted(Shac):
         return optax.chain(plant, super().actor_optimizer(env))
 
 
-@pytest.mark.parametrize(
-    "fault", [fault if fault == "noise" else pytest.param(fault, marks=pytest.mark.slow) for fault in WRONG]
-)
+@pytest.mark.parametrize("fault", ["half of the units", pytest.param("none", marks=pytest.mark.slow)])
 def test_a_layer_that_moves_along_a_wrong_gradient_is_named(fault):
     env = environment(cartpole_program(horizon=12, substeps=1))
     exact = Training(env, Planted(**TRAINERS["shac"], fault=fault))
