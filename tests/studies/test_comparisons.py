@@ -11,7 +11,6 @@ from bench.plugins.studies.bias_variance.comparisons import (
     WORKS,
     at_equal_rollouts,
     compare_errors,
-    leaders,
     method_table,
     ratio,
     verdict,
@@ -191,11 +190,11 @@ def test_a_far_larger_error_does_not_share_the_first_place_of_an_error_that_is_n
     biased = exact | {"rmse_rel": 0.9, "bias": 0.9, "bias_low": 0.87, "bias_high": 0.92}
     wide = exact | {"rmse_rel": 0.17, "bias": 0.17, "bias_low": 0.1, "bias_high": 1.7}
     good = exact | {"rmse_rel": 0.14, "bias": 0.14, "bias_low": 0.13, "bias_high": 0.15}
-    methods, compared = made(
+    _, compared = made(
         row(stiffness=1.0, estimator="fobg", **good), row(stiffness=1.0, estimator="smooth", **wide),
         row(stiffness=2.0, estimator="fobg", **biased), row(stiffness=2.0, estimator="smooth", **wide),
     )  # fmt: skip
-    assert list(leaders(compared, methods)) == [("fobg", "smooth"), ("smooth",)]
+    assert list(compared["leaders"]) == [("fobg", "smooth"), ("smooth",)]
 
 
 def vague(low, high, **values):
@@ -212,7 +211,7 @@ def test_an_upper_limit_is_shown_and_never_first_nor_bold():
     methods, compared = made(*cells)
     assert list(compared["first"]) == ["reinforce", ""], "the limit is below the other's interval at 1e4"
     assert list(compared["tied"]) == [("fobg",)] * 2
-    assert list(leaders(compared, methods)) == [("reinforce", "fobg"), ("fobg",)]
+    assert list(compared["leaders"]) == [("reinforce", "fobg"), ("fobg",)]
     assert compared["factor"].isna().all()
     limit = math.hypot(0.1, 0.02)
     assert methods.loc[methods["error_is_limit"], "error"].tolist() == pytest.approx([limit] * 2)

@@ -31,7 +31,6 @@ from .comparisons import (
     WORKS,
     at_equal_rollouts,
     compare_errors,
-    leaders,
     lowest,
     method_table,
     problems_by_axis,
@@ -114,7 +113,7 @@ def tables(
     main, *others = pivots(shown, lowest(equal))
     is_ranked = methods["estimator"].nunique() >= LEAST and methods["problem"].nunique() > 1
     names = {name: errors[name].map(", ".join) for name in ("tied", "not_comparable")}
-    joined = errors.drop(columns="setting").assign(**names)
+    joined = errors.drop(columns=["setting", "leaders"]).assign(**names)
     columns = [replace(c, note="factor_note") if c.name == "factor" else c for c in COMPARED]
     title = "the first and the next at each setting, at equal rollouts"
     return [
@@ -287,7 +286,7 @@ def recommendations(methods: pd.DataFrame) -> Table:
     methods = methods.assign(failed=methods["verdict"].isin((FAILS, NO_RESULT)))
     now = verdict(methods["status"], *(methods[name] for name in ERROR))
     good = methods[(now == WORKS) & ~methods["failed"]]
-    use = methods["setting"].map(leaders(compare_errors(good), good)).astype(object)
+    use = methods["setting"].map(compare_errors(good).set_index("setting")["leaders"]).astype(object)
     is_lost = methods.groupby("setting")["failed"].transform("all")
     missing = is_lost.map({True: ("none works",), False: ("none is known to work",)})
     lines = [
