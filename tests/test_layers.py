@@ -132,7 +132,6 @@ def test_plugins_import_only_public_names():
 HOMONYMS = {
     "jax", "torch", "numpy", "mujoco",  # libraries
     "mjcf",  # a file format
-    "orthogonal", "sobol",  # designs of draws
     "clipped", "constant", "linear", "plain", "growth", "solver", "engines",  # words of the contracts, of a verb or of English
 }  # fmt: skip
 """Names of plugins that the core uses for something else."""

@@ -22,8 +22,8 @@ from classes import (
     Plain,
     Pushing,
     Quadratic,
+    QuadraticModel,
     SemiImplicitEuler,
-    Sobol,
 )
 from trees import INHERITED, bench
 
@@ -131,8 +131,8 @@ class SixteenSamples(FirstOrder):
 
 
 @planted("variance_falls_as_one_over_n")
-class UndeclaredCoupling(Sobol):
-    """Zeroth-order along quasi-random directions, which it does not declare."""
+class UndeclaredCoupling(QuadraticModel):
+    """Zeroth-order less a model fitted to the samples, which it does not declare."""
 
     couples_samples: ClassVar[bool] = False
 

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from classes import Fobg, Guided, MeasureValued, Numpy, Orthogonal, RandomizedSmoothing, Reinforce, SphereSmoothing
+from classes import Fobg, Guided, MeasureValued, Numpy, RandomizedSmoothing, Reinforce, SphereSmoothing
 from helpers import loaded
 
 from bench.experiment.session import Problems
@@ -54,7 +54,7 @@ def compiled(scene):
 
 @pytest.mark.parametrize(
     "estimator",
-    [Fobg(), Reinforce(), MeasureValued(), RandomizedSmoothing(), RandomizedSmoothing(variant="forward"), Orthogonal(), Guided(share=1.0),
+    [Fobg(), Reinforce(), MeasureValued(), RandomizedSmoothing(), RandomizedSmoothing(variant="forward"), Guided(share=1.0),
      SphereSmoothing()],
     ids=str,
 )  # fmt: skip

@@ -12,9 +12,7 @@ from bench.measure import noise
 REFUSED = [
     ("randomized_smoothing[mirrored=true]", "pendulum", 128, "both ways already"),
     ("sphere_smoothing[mirrored=true]", "pendulum", 128, "both ways already"),
-    ("orthogonal[draws=sobol]", "pendulum", 128, "independent draws, without draws=sobol"),
-    ("sobol[mirrored=true]", "pendulum", 128, "independent draws"),
-    ("quadratic_model[mirrored=true]", "pendulum", 128, "independent draws"),
+    ("quadratic_model[draws=sobol]", "pendulum", 128, "independent draws, without draws=sobol"),
     ("total_propagation[per=action,draws=sobol]", "pendulum", 128, "independent draws"),
     ("plain[mirrored=true]", "pendulum", 128, "no noise in J"),
     ("fobg[mirrored=true]", "pendulum", 99, "samples=99 is odd"),

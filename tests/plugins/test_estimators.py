@@ -13,7 +13,6 @@ from classes import (
     Fobg,
     Guided,
     Numpy,
-    Orthogonal,
     Penalty,
     Plain,
     PlainDifference,
@@ -84,21 +83,17 @@ def test_sharing_takes_every_sample_for_both_orders():
     assert (alpha > 0).all()
 
 
-FIXED = Orthogonal(lengths="fixed")
 ON_A_PLANE = [
     (RandomizedSmoothing(), 8, 9 / 8),
     (RandomizedSmoothing(variant="forward"), 8, 9 / 8),
     (FiniteDifference(), 8, 0.0),
     (SphereSmoothing(), 8, 7 / 8),
-    (FIXED, 8, 0.0),
-    (FIXED, 2, 3.0),
     (ControlVariate(), 8, 0.0),  # what differences leave of the gradient at w = 0
     (Guided(subspace=1, share=0.1), 2, 2.7),
 ]
 """Estimator, samples, and the relative squared error on a plane of 8 variables.
 
-It is (d + 1) / N of a normal, (d - 1) / N of a sphere, d / N - 1 of orthogonal directions (Choromanski et al. 2018), and
-2 + 7 share of guided ones.
+It is (d + 1) / N of a normal, (d - 1) / N of a sphere, and 2 + 7 share of guided ones.
 """
 
 
@@ -112,10 +107,6 @@ def error_on_a_plane(estimator, samples):
 @pytest.mark.parametrize(("estimator", "samples", "error"), ON_A_PLANE, ids=str)
 def test_errors_on_a_plane_are_their_closed_forms(estimator, samples, error):
     assert error_on_a_plane(estimator, samples) == pytest.approx(error, rel=0.06, abs=1e-16)  # 2.7 varies by 2%
-
-
-def test_orthogonal_directions_halve_the_error_on_a_plane():
-    assert error_on_a_plane(Orthogonal(), 8) < 0.5 * 9 / 8
 
 
 def test_clipping_a_batch_cuts_its_norm():

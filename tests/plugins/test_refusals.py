@@ -34,7 +34,6 @@ ESTIMATORS = [
     ("stochastic_derivative", "coin_walk", None),
     ("planted[angle=30]", "heaviside", "at least 2 coordinates"),
     ("quadratic_model", "cartpole", "noise on theta"),
-    ("sobol", "linear[dimension=21202]", "21,201 coordinates"),
     ("total_propagation[per=action]", "pushing", None),
     ("total_propagation[per=action]", "pushing[hold=3]", "noise on the action"),
     ("total_propagation[per=action]", "bouncing_ball", "noise on the action"),

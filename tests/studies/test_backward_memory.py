@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bench.plugins.studies.backward_memory import spread
 from helpers import unmeasured
 
 import bench
@@ -61,13 +60,6 @@ def test_a_planted_array_is_the_peak_of_each_call_in_a_process_per_cell(tmp_path
     assert rows["process_mb"].iloc[1] == pytest.approx(rows["process_mb"].iloc[0], abs=PLANTED_MB), (
         "not what others kept"
     )
-
-
-def test_the_range_of_six_calls_covers_a_median():
-    draws = np.random.default_rng(0).exponential(size=(4000, 6))
-    ends = [spread("x", list(row)) for row in draws]
-    covered = np.mean([one["x_low"] <= math.log(2) <= one["x_high"] for one in ends])
-    assert covered == pytest.approx(1 - 2**-5, abs=0.01), "closed form, and four standard errors of 4,000 draws"
 
 
 # ----------------------------------------------------------------------------------------------------- views

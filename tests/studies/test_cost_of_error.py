@@ -1,23 +1,19 @@
 """The study of errors: closed forms of descent, exclusions, ratios with their test over scenes, and a whole run."""
 
-import dataclasses
 import math
 
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.studies.optimise.measure import objective
-from classes import Adam, CartpoleSwing, GradientDescent, Planted, Quadratic
+from classes import Adam, GradientDescent, Planted, Quadratic
 from dose_response import analysis, views
 from dose_response.batched import run_batched
-from dose_response.ground import BestGradient, scored_noise
-from dose_response.measure import compare, hypotheses_hash
+from dose_response.measure import compare
 from dose_response.search import TARGETS, Method, Task, follow, run_searches, tune, unit_rate
 from trees import ROOT
 
 import bench
 from bench.experiment import config
-from bench.model import slopes
 
 PAPER = ROOT / "examples" / "cost_of_error"
 D = 8
@@ -59,37 +55,6 @@ def test_descent_along_a_rotated_gradient_takes_the_updates_of_its_closed_form(b
     assert search.updates == reachable
 
 
-def test_descent_with_relative_noise_has_the_mean_regret_of_its_closed_form(bowl):
-    """E f falls by (1 - s)^2 + (s e)^2 per step for noise of relative size e."""
-    share, noise, steps, seeds = 0.4, 0.8, 6, 400
-    method = Method(GradientDescent(rate=share / curvature(bowl)), Planted(base="best", noise=noise), 4)
-    task = dataclasses.replace(task_of(bowl, steps), optimum=-1e9)  # no target is reached
-    paths = [follow(bowl, method, task, seed, keep=True).thetas for seed in range(seeds)]
-    squares = np.array([[theta @ theta for theta in path] for path in paths])
-    ratio = squares[:, -1] / squares[:, 0]
-    factor = (1 - share) ** 2 + (share * noise) ** 2
-    assert ratio.mean() == pytest.approx(factor**steps, abs=4 * ratio.std() / math.sqrt(seeds))
-
-
-def test_with_random_starts_the_best_gradient_is_that_of_the_scored_cost():
-    """Both are means over the same fixed starts, so that differences of the cost give the gradient, and no noise remains."""
-    scene = CartpoleSwing(horizon=6, noise="parameter", sigma=0.05, policy="mlp[hidden=2]")
-    problem = bench.problem(scene, integrator="semi_implicit_euler", backend="jax")
-    program, theta = problem.program, problem.program.theta0
-    scored = scored_noise(problem, "cartpole_swing")
-    assert scored.shape == (program.dim + 8, 8)
-    assert not scored[: program.dim].any()
-    assert len(np.unique(scored[program.dim :])) == 64
-    noise = np.random.default_rng(0).standard_normal((3, 2, program.n_noise))
-    direction, step = np.random.default_rng(1).standard_normal(program.dim), 1e-5
-    ahead, behind = (objective(problem, theta + s * direction, scored) for s in (step, -step))
-    slope = (ahead - behind) / (2 * step)
-    for estimator in (BestGradient(), Planted(base="best")):
-        gradients = estimator.estimate(problem, theta, noise)
-        assert gradients.shape == (3, program.dim)
-        assert gradients @ direction == pytest.approx([slope] * 3, rel=1e-6)
-
-
 def test_tuning_finds_the_rate_that_solves_a_quadratic_in_one_step(bowl):
     """The rate 1 / curvature moves the largest element by its own size; the grid contains it once it is widened."""
     method = Method(GradientDescent(), Planted(base="best"), 1, is_random=False)
@@ -100,12 +65,6 @@ def test_tuning_finds_the_rate_that_solves_a_quadratic_in_one_step(bowl):
     assert all(found.is_inside)
     assert found.rates[found.best[-1]] == pytest.approx(1 / curvature(bowl), rel=DIFFERENCED)
     assert found.updates[found.best[-1]].tolist() == [1.0] * len(TARGETS)
-
-
-def test_unit_rate_makes_the_first_step_one(bowl):
-    gradient = np.linspace(-3.0, 2.0, D)
-    assert unit_rate(GradientDescent(), gradient) == pytest.approx(1 / 3)
-    assert unit_rate(Adam(), gradient) == pytest.approx(1.0, rel=1e-6)
 
 
 def test_searches_in_shared_calls_equal_separate_searches(bowl):
@@ -121,14 +80,6 @@ def test_the_error_of_one_of_the_searches_that_share_calls_is_raised(bowl):
     searches = [lambda lane, width=width: lane.value(np.zeros(lane.dim), np.zeros((width, 1))) for width in widths]
     with pytest.raises(bench.UserError, match=r"noise w has the shape \(9, 1\)"):
         run_batched(bowl, searches)
-
-
-def test_step_jacobians_of_searches_that_share_batches():
-    """Without step Jacobians of the backend they are differences, in a shared problem too."""
-    problem = bench.problem("lqr[horizon=5]", backend="numpy")
-    theta, still = np.ones(5), np.zeros((5, 1))
-    (shared,) = run_batched(problem, [lambda lane: slopes(lane, theta, still).a])
-    assert np.array_equal(shared, slopes(problem, theta, still).a)
 
 
 def test_compare_splits_the_error_into_bias_and_spread():
@@ -163,14 +114,6 @@ def run(tmp_path_factory):
         "repeats=4",
     ]
     return bench.run(words)
-
-
-@pytest.mark.slow
-def test_every_cell_of_a_run_has_a_row_with_the_hash_of_the_hypotheses(run):
-    assert set(run["status"]) == {"ok"}
-    assert set(run["hypotheses"]) == {hypotheses_hash()}
-    assert len(hypotheses_hash()) == 12
-    assert run[["gradient_s", "rollout_s"]].gt(0).all(axis=None), "a run without timing keeps the cost of a gradient"
 
 
 def test_planted_errors_of_a_run_have_their_size_on_the_common_path(run):
@@ -224,17 +167,6 @@ def test_ratios_are_those_of_the_same_problem_and_missed_targets_count():
     both = compared(lines, "bias 0.9 / random error 1")
     assert (both["problems"], both["ratio"], both["ratio_low"], both["ratio_high"]) == (6, 3.0, 3.0, 3.0)
     assert both.equals(compared(lines, "bias 0.9 / random error 1", analysis.ALL))
-
-
-def test_equal_errors_are_compared_between_the_planted_sizes_that_reach_the_target():
-    """Updates 10 and 40 at .3 and 3 are 20 between them; an error of 5, and a size that misses, do not count."""
-    sizes = (0.3, 10.0), (3.0, 40.0), (10.0, math.inf)
-    lines = [planted(f"p{i}", analysis.RANDOM, *size) for i in range(6) for size in sizes]
-    lines += [planted(f"p{i}", "first order", math.sqrt(0.9), 60.0) for i in range(6)]
-    lines += [planted(f"p{i}", "first order", 5.0, 1e6) for i in range(6)]
-    table = pd.DataFrame(lines).assign(method="fobg", samples=1, rollouts_per_update=0, gradients_per_update=1)
-    found = compared(table, "first order / random error, equal error")
-    assert (found["ratio"], found["verdict"]) == (pytest.approx(3.0), "above 1")
 
 
 @pytest.mark.parametrize(("scenes", "verdict"), [(6, "above 1"), (5, "not known")])

@@ -7,13 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from bench.plugins.studies.engines import LEVELS, levels
-from helpers import stored
 
 import bench
 from bench.cli import main
 from bench.engines.process import close_engines
-from bench.report import finish
-from bench.report.web.data import page_data
 
 TOYS = Path(__file__).resolve().parents[1] / "engines" / "toys"
 
@@ -82,19 +79,3 @@ def test_levels_of_a_gradient(expected, changes):
     }  # fmt: skip
     assert levels(pd.DataFrame([good | changes])) == [expected]
     assert expected in LEVELS
-
-
-def test_the_page_shows_the_limit_that_the_table_shows():
-    """The page showed the stored number, where the table had the end of its interval."""
-    made, rows = stored("engine_gradients")
-    shown = finish.views_of(made, rows)
-    data = page_data(made, rows, shown, [[]] * len(rows))
-    newton = "scene == 'cartpole' and backend == 'newton'"
-    place = rows.reset_index(drop=True).query(newton).index[0]
-    named = newton.replace("cartpole", "cartpole[horizon=25]")  # tables name what differs from the defaults
-    limit = shown.tables[0].frame.query(named)["rmse_rel"].item()
-    assert rows["rmse_rel"].iloc[place] < limit / 5
-    assert next(column for column in data["columns"] if column["name"] == "rmse_rel")["flag"] == "rmse_is_limit"
-    cells = {name: data["cells"][name] for name in ("rmse_rel", "rmse_is_limit")}
-    assert cells["rmse_is_limit"][place] == 1.0
-    assert cells["rmse_rel"][place] == pytest.approx(limit, rel=1e-5)  # the page has six digits

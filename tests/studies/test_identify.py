@@ -7,27 +7,21 @@ import numpy as np
 import pandas as pd
 import pytest
 import wrong_models
-from bench.plugins.optimizers.gauss_newton import GaussNewton
 from bench.plugins.studies.identify import views as shown
 from bench.plugins.studies.identify.measure import (
-    Fitting,
-    count_windows,
     information,
     missing_terms,
     model_of,
-    run_fits,
 )
 from bench.plugins.studies.identify.record import evaluate
 from helpers import loaded, stored, unmeasured
 from scipy.integrate import solve_ivp
 
 import bench
-from bench.cli import main
 from bench.errors import Unsupported
 from bench.experiment import config
 from bench.measure import adequacy
 from bench.measure.identification import Information, product
-from bench.model import Answer
 
 SPRING = ("scenes=[mass_spring_damper]", "integrators=[rk4]")
 FORCED = ("scenes=[mass_spring_damper[force=0.5]]", "integrators=[rk4]")
@@ -61,23 +55,6 @@ def displacement(k, c, t):
     return np.exp(-a * t) * (np.cos(w * t) + a / w * np.sin(w * t))
 
 
-def closed_form_fisher():
-    """Fisher matrix of (k/m, c/m) for 200 samples to T = 10 with noise .01, from the closed form of the motion."""
-    t, h = 0.05 * np.arange(1, 201), 1e-6
-    by_k = (displacement(4 + h, 0.4, t) - displacement(4 - h, 0.4, t)) / (2 * h)
-    by_c = (displacement(4, 0.4 + h, t) - displacement(4, 0.4 - h, t)) / (2 * h)
-    rows = np.stack([by_k, by_c]) / 0.01
-    return rows @ rows.T
-
-
-def test_information_is_that_of_the_closed_form():
-    found = known(*SPRING, "theta=[stiffness,damping]")
-    scale = np.array([4.0, 0.4])  # logarithms
-    assert found.jacobian.T @ found.jacobian == pytest.approx(
-        closed_form_fisher() * np.outer(scale, scale), rel=STEPPED
-    )
-
-
 @pytest.mark.parametrize(
     ("words", "labels"),
     [
@@ -102,21 +79,6 @@ def test_words_of_products():
     assert Information(names, np.diag([1.0, 1.0, 0.0])[:2]).labels == ["a", "b"]  # c moves nothing
 
 
-def test_friction_fitted_with_a_step_holds_for_that_step():
-    """d = v0^2/(2 mu g) = 1.529052, dd/dmu = -5.096840, and mu_hat/mu = 1 - h mu g/v0."""
-    exact, model = 9.0 / (2 * 0.3 * 9.81), model_of(cell_of("scenes=[sliding_block]"))
-    assert exact == pytest.approx(1.529052, rel=1e-6)
-    assert -exact / 0.3 == pytest.approx(-5.096840, rel=1e-6)
-    fitting = Fitting(model, "single", 1, 0.01)
-    found = np.exp(run_fits(fitting, GaussNewton(), np.log([[0.25]]), np.array([[exact]]), 40)[0])[0, 0]
-    # the stop within a step leaves a second-order rest
-    assert found / 0.3 == pytest.approx(1 - 0.02 * 0.3 * 9.81 / 3.0, abs=2e-3)
-    fine = model_of(cell_of("scenes=[sliding_block[dt=0.0005,horizon=2400]]"))
-    assert (fine.record(np.array([[0.3 * 1.001, 0.3 * 0.999]])) @ [1, -1]) / 0.0006 == pytest.approx(
-        [-5.09684], rel=0.01
-    )
-
-
 @pytest.mark.slow
 def test_a_row_in_all_ways():
     row = row_of("scenes=[mass_spring_damper[horizon=80]]", "integrators=[rk4]", "repeats=12")
@@ -133,15 +95,6 @@ def test_model_of_a_coarse_step_says_so():
     row = row_of("study=identify[refine=16]", "scenes=[sliding_block]", "repeats=16")
     assert row["step_shift_bound"] > shown.MAX_STEP_SHIFT
     assert row["coverage_high"][0] < 0.95
-
-
-@pytest.mark.slow
-def test_cramer_rao_is_reached_over_500_records_and_none_hides_the_gauge():
-    row = row_of("study=identify[windows=2]", *SPRING, "repeats=500")
-    assert row["hidden"][0] == 0
-    # the relative error of a standard deviation from 500 draws of two numbers
-    assert abs(row["error"][0] - 1.0) < 4 / math.sqrt(2 * 1000)
-    assert row["coverage_low"][0] < 0.95 < row["coverage_high"][0]
 
 
 def refused(*words):
@@ -255,26 +208,6 @@ def test_irregular_times_are_resampled_and_starts_and_zeros_are_fitted(tmp_path)
     assert row["estimate_low"][0] == pytest.approx(2 * row["estimate"][0] - row["estimate_high"][0])
 
 
-@pytest.mark.slow
-def test_a_pendulum_with_dry_friction_from_a_csv(tmp_path, capsys):
-    """The estimate is on the first screen, with the bias that friction can cause."""
-    words = [
-        f"study=identify[{pendulum(tmp_path, 0.02, drag=0.04615)},state={{q0: 1}}]",
-        *SWING[1:2],
-        "backends=[numpy]",
-    ]
-    words += ["theta=[mass,damping]", "scenes=[pendulum[torque=0,damping=0.01,horizon=300]]", f"results_dir={tmp_path}"]
-    assert main(words) == 0
-    lines = capsys.readouterr().out.splitlines()
-    estimate = next(line for line in lines[:12] if line.startswith("damping/mass"))
-    value, low, high, bias = map(float, estimate.split()[1:5])
-    truth = 0.04615 * 0.25
-    assert low < value < high < low + 0.1 * value
-    assert truth < low  # the friction looks like damping
-    (friction,) = [line.split() for line in lines if line.startswith("damping/mass  dry friction of q0")]
-    assert bias >= float(friction[5]) > value - truth
-
-
 def test_missing_terms_are_the_derivatives_of_the_record_by_them():
     model = wrong_models.PAIRS["pendulum"]
     theta = model.values
@@ -334,25 +267,6 @@ def test_a_parameter_that_moves_nothing_has_no_interval():
     assert estimates.loc["stiffness", "identifiable"] == "yes"
 
 
-def test_fits_stop_where_they_have_converged():
-    model = model_of(cell_of(*SPRING, "theta=[stiffness,damping]"))
-    data = model.record(model.values[:, None]) + 0.01 * np.random.default_rng(3).standard_normal((200, 1))
-    fitting, calls = Fitting(model, "single", 1, 0.01), []
-
-    class Counting(GaussNewton):
-        def ask(self, state, noise):
-            calls.append(1)
-            return super().ask(state, noise)
-
-    start = fitting.start(1.2 * model.values[:, None], data)
-    found, has_converged = run_fits(fitting, Counting(), start, data, 40)
-    assert has_converged.all()
-    assert len(calls) < 15
-    exact, _ = run_fits(fitting, GaussNewton(), found, data, 40)
-    errors = information(model, model.values, 0.01).bound
-    assert (np.abs(found - exact)[:, 0] < 1e-3 * errors).all()
-
-
 def test_fits_take_gauss_newton_unless_another_optimizer_is_named():
     """A record of one's own, fitted by the default of other studies, ended elsewhere and the model was blamed."""
     for words, chosen in (
@@ -361,10 +275,6 @@ def test_fits_take_gauss_newton_unless_another_optimizer_is_named():
         (["study=optimise"], "adam"),
     ):
         assert [str(choice) for choice in config.load([*words, *SPRING]).choices["optimizer"]] == [chosen]
-
-
-def test_number_of_windows():
-    assert [count_windows(horizon, 8) for horizon in (200, 7, 12, 1)] == [8, 1, 6, 1]
 
 
 # ------------------------------------------------------------------------------------- models that do not explain
@@ -442,20 +352,6 @@ def test_a_missing_term_of_the_stated_reach_is_noticed_at_the_stated_power():
     data = without(line, noise + first.reach["cubic"] * term["cubic"][:, None])
     noticed = np.mean([not adequacy.judge(data[:, i], line, 1, term, i).is_explained for i in range(40)])
     assert noticed >= adequacy.POWER - 0.1  # three standard errors
-
-
-def test_levenberg_marquardt_needs_as_few_evaluations_as_minpack_on_rosenbrock():
-    """SciPy's needs 21; the rule that changed the damping tenfold needed 44."""
-    optimizer, evaluations = GaussNewton(), 0
-    state = optimizer.start(np.array([-1.2, 1.0]))
-    while True:
-        x = optimizer.ask(state, np.empty((2, 0)))
-        residual = np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]])
-        jacobian = np.array([[-20 * x[0, 0], 10.0], [-1.0, 0.0]])[:, :, None]
-        state, evaluations = optimizer.tell(state, x, Answer(residual=residual, jacobian=jacobian)), evaluations + 1
-        if 0.5 * float((residual**2).sum()) < 1e-20:
-            break
-    assert evaluations <= 21
 
 
 # ---------------------------------------------------------------------------------------------------- what is shown

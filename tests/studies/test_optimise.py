@@ -1,16 +1,14 @@
 """The study of searches: known optima, stops, refusals, tables and charts, and the statistics that sum them up."""
 
 import math
-import re
 
 import numpy as np
 import pandas as pd
 import pytest
 from bench.plugins.studies.optimise import views as studied
 from bench.plugins.studies.optimise.measure import scene_class
-from classes import ExplicitEuler, Impulse, Lqr, Penalty, SemiImplicitEuler, StaticGain, TwoBalls
-from helpers import loaded, stored
-from scipy.linalg import solve_discrete_lyapunov
+from classes import ExplicitEuler, Impulse, Lqr, Penalty, SemiImplicitEuler, TwoBalls
+from helpers import loaded
 
 import bench
 from bench.cli import main
@@ -46,44 +44,6 @@ def test_regulator_knows_its_optimum_and_value():
         )
 
 
-def test_scalar_regulator():
-    """A = B = Q = 1, R = .1, Q_f = 10, T = 10: J* 1.0916079783, J(0) 20, and 100 copies of it with one constant gain."""
-    scene = StaticGain(copies=1)
-    assert scene.cost_to_go(np.zeros((1, 1)), np.ones((1, 1)), 0)[0] == pytest.approx(1.0916079783, rel=1e-9)
-    assert StaticGain(copies=100).optimum(None, None)[0] == pytest.approx(109.1607978, rel=1e-9)
-    problem = bench.problem("static_gain[copies=3]", backend="numpy")
-    costs = problem.value(
-        np.stack([np.zeros(9), np.full(9, -0.9160798 / 3), -0.9160798 * np.eye(3).ravel()], axis=1), np.zeros((9, 3))
-    )
-    assert costs == pytest.approx([60.0, 3.274823934, 3.274823934], rel=1e-8)  # every K with K 1 = -.9160798
-
-
-GAIN = np.array([[-0.9, 0.05], [0.1, -0.8]])
-"""A gain u = K x of two copies under which x' = x + u dies out."""
-
-
-def test_gradient_of_a_static_gain():
-    """2 [(R + B'PB) K + B'PA] S, with P and S of discrete Lyapunov equations; 80 steps are as good as all."""
-    problem = bench.problem("static_gain[copies=2,horizon=80]", backend="numpy")
-    closed = np.eye(2) + GAIN
-    value = solve_discrete_lyapunov(closed.T, np.eye(2) + 0.1 * GAIN.T @ GAIN)
-    states = solve_discrete_lyapunov(closed, np.ones((2, 2)))
-    assert problem.value(GAIN.ravel(), np.zeros((4, 1)))[0] == pytest.approx(value.sum(), rel=1e-9)
-    expected = 2 * ((0.1 * np.eye(2) + value) @ GAIN + value) @ states
-    assert problem.grad(GAIN.ravel(), np.zeros((4, 1)))[:, 0] == pytest.approx(expected.ravel(), rel=CHECKED)
-
-
-def test_noise_on_actions_adds_what_it_costs():
-    """E J = x0'P x0 + sigma^2 sum_t (tr R + tr B'P_{t+1}B), with the values P of the gain itself."""
-    problem = bench.problem("static_gain[copies=2,noise=action,sigma=0.3]", backend="numpy")
-    costs = problem.value(GAIN.ravel(), np.random.default_rng(0).standard_normal((20, 40_000)))
-    value, noise, closed = 10 * np.eye(2), 0.0, np.eye(2) + GAIN
-    for _ in range(10):
-        noise += 0.3**2 * (0.1 * 2 + np.trace(value))
-        value = np.eye(2) + 0.1 * GAIN.T @ GAIN + closed.T @ value @ closed
-    assert abs(costs.mean() - value.sum() - noise) < 4.5 * costs.std() / 200
-
-
 def test_two_balls():
     assert TwoBalls().optimum(Impulse(), None)[0] == pytest.approx(1.39654216, rel=1e-8)
     problem = bench.problem("two_balls", contact="impulse", backend="numpy")
@@ -91,37 +51,6 @@ def test_two_balls():
     assert TwoBalls(effort=10.0).optimum(Impulse(), None)[0] == 2.0  # no blow is worth it
     assert TwoBalls().optimum(Penalty(), None) is None
     assert Lqr().optimum(None, ExplicitEuler()) is None
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("scene", "contact", "start", "least"),
-    [
-        ("pendulum_swing[dt=0.02]", None, 2008.0153, 872.590419),
-        ("pendulum_swing", None, 2022.303027, 349.49046),
-        ("pendulum_swing[terminal=1]", None, 1856.154406, 349.490454),
-        ("pushing[horizon=400,dt=0.005,velocity_factor=0.998]", "penalty[stiffness=10]", 2374.89381, 1126.585263),
-        ("pushing[horizon=200,dt=0.005,velocity_factor=0.99]", "penalty[stiffness=1000]", 1821.249, None),
-    ],
-)
-def test_newton_finds_the_checked_optima(scene, contact, start, least):
-    steps = int(re.findall(r"horizon=(\d+)|$", scene)[0] or 0)
-    problem = bench.problem(scene, contact=contact, theta0=[0.1] * steps or None)
-    assert problem.value(problem.program.theta0, np.zeros((problem.program.n_noise, 1)))[0] == pytest.approx(
-        start, rel=CHECKED
-    )
-    if least:
-        found = solve(problem)
-        assert found.cost == pytest.approx(least, rel=CHECKED)
-        assert found.certified or contact
-
-
-@pytest.mark.parametrize("steps", [4, 10, 50])
-def test_least_effort_from_rest_to_rest(steps):
-    """A metre in a second: 12 in continuous time, 12 / (1 - 1 / N^2) in N semi-implicit steps."""
-    ends = {"position": 0.0, "speed": 0.0, "end_position": 1e9, "end_speed": 1e9}
-    scene = Lqr(horizon=steps, dt=1 / steps, effort=1 / steps, **ends)
-    assert scene.optimum(None, SemiImplicitEuler())[0] == pytest.approx(12 / (1 - 1 / steps**2), rel=CHECKED)
 
 
 def test_classes_of_problems():
@@ -260,17 +189,6 @@ def test_interquartile_mean_by_hand():
     assert performance.interquartile_mean(np.arange(8.0)) == pytest.approx(3.5)
 
 
-def test_bootstrap_interval_of_a_mean_covers():
-    rng = np.random.default_rng(1)
-    hits = 0
-    for seed in range(200):
-        low, high = performance.bootstrap(
-            [rng.standard_normal(30) + 1.0], lambda parts: float(parts[0].mean()), seed, 200
-        )
-        hits += low <= 1.0 <= high
-    assert hits / 200 > 0.88
-
-
 def searches(finals):
     """One problem's searches: final costs by method and tuning, one for each seed."""
     rows = [
@@ -316,25 +234,6 @@ def test_a_method_beats_the_baseline_in_the_share_of_pairs_that_it_wins():
 
 
 # ---------------------------------------------------------------------------------------------------- what is shown
-
-
-@pytest.fixture(scope="module")
-def standard():
-    """The rows of the smallest standard experiment, and its views."""
-    given, rows = stored("optimise/small")
-    return rows, study_of(given).views(given, rows)
-
-
-def test_charts_have_the_tables_numbers(standard):
-    """The dots are the summary's shares, and the lines of runtimes end at them."""
-    rows, views = standard
-    charts = {chart.name: chart for chart in views.charts}
-    assert next(iter(charts)) == "targets"
-    shares = charts["targets"].frame.set_index("method")["reached"]
-    assert list(shares) == sorted(shares, reverse=True)
-    ends = charts["runtimes"].frame.groupby("method")["share"].max()
-    assert ends.to_dict() == pytest.approx(shares.to_dict())
-    assert len(views.rows) == len(rows)
 
 
 def raced(rates, scenes):

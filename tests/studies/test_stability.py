@@ -12,7 +12,6 @@ from helpers import loaded, unmeasured
 
 from bench.errors import Unsupported
 from bench.model import MechanicalScene, State, registry
-from bench.model.parameters import build
 from bench.run import tasks
 from bench.run.session import Session
 
@@ -74,11 +73,18 @@ class Drop(MechanicalScene):
 LIMITS = Stability()
 
 
-@pytest.mark.parametrize("damping", [0.0, pytest.param(3.0, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("integrator", sorted(registry.entries()["integrators"]))
-def test_measured_boundary_is_within_a_cell_of_the_theoretical_one(integrator, damping):
+@pytest.mark.parametrize(
+    "integrator",
+    [
+        name
+        if name in ("semi_implicit_euler", "midpoint", "implicit_euler")
+        else pytest.param(name, marks=pytest.mark.slow)
+        for name in sorted(registry.entries()["integrators"])
+    ],
+)
+def test_measured_boundary_is_within_a_cell_of_the_theoretical_one(integrator):
     """For every integrator, those too that grow too slowly to diverge within the rollout."""
-    rows = swept(integrator, f"scene.mass_spring.damping={damping}")
+    rows = swept(integrator)
     assert agrees(rows)
     assert rows["growth_factor"].to_numpy() == pytest.approx(rows["spectral_radius"].to_numpy(), rel=1e-6)
 
@@ -107,18 +113,6 @@ def test_backends_without_step_jacobians_are_classified_alike(backend):
     assert list(rows["verdict"]) == ["inaccurate", "wrong_sign", "diverged", "diverged"]
     assert all(rows["reason"][2:])
     assert rows["growth_factor"][0] == pytest.approx(rows["spectral_radius"][0], abs=1e-9)
-
-
-def test_first_bad_step_and_its_state_are_in_the_row():
-    rows = swept("semi_implicit_euler")
-    row = rows[rows["verdict"] == "diverged"].iloc[0]
-    assert row["status"] == "diverged"
-    assert f"step {int(row['first_bad_step'])} of {HORIZON}" in row["reason"]
-    k, theta = row["stiffness"], np.array([0.1, 0.0])
-    step = np.array([[1 - 2 * k * DT**2, DT], [-2 * k * DT, 1.0]])
-    # The power and the rollout round differently, by an ulp a step, amplified as the states are.
-    state = np.linalg.matrix_power(step, int(row["first_bad_step"])) @ theta
-    assert np.allclose(row["state_at_first_bad_step"], state, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -171,18 +165,6 @@ def test_contact_springs_are_oscillators_while_they_last():
     assert stability.oscillator(cell) == (50.0, 2.0, 1.0)
 
 
-def test_limits_hold_what_is_known():
-    def limit(name):
-        entry = registry.find("integrators", name)
-        return stability.stiffness_limit(build(entry.plugin, {}), 0.5, 0.0, 1.0) * 0.25
-
-    assert limit("semi_implicit_euler") == pytest.approx(4.0, rel=1e-6)
-    assert limit("stormer_verlet") == pytest.approx(4.0, rel=1e-6)
-    assert limit("rk4") == pytest.approx(8.0, rel=1e-6)  # |R(iz)| = 1 at z = 2 sqrt 2
-    assert limit("explicit_euler") == limit("midpoint") == 0.0
-    assert limit("implicit_euler") == limit("implicit_midpoint") == math.inf
-
-
 def test_backends_that_disagree_show_the_worse_verdict_and_no_verdict_is_no_finding():
     words = "study=stability", "scenes=[mass_spring]", "backends=[jax,numpy]", "sweep.stiffness=[10,100]"
     given, rows = unmeasured(*words, "estimators=[fobg]", verdict="ok")
@@ -225,21 +207,6 @@ def test_planted_causes_are_named(monkeypatch, own, coarse, cause):
     _, (cell,) = cells_of("scenes=[bouncing_ball]", "contacts=[penalty]", "integrators=[rk4]", "backends=[numpy]")
     row = stability.cause_of(cell, "physical", np.array([2.0, 0.0]), np.array([1.0, 0.0]), LIMITS)
     assert row["cause"] == cause
-
-
-def test_the_cause_is_the_law_or_the_step():
-    """A contact as soft as 10 N/m is not rigid at any step; a fine step follows it, a coarse one does neither."""
-    causes = {}
-    for steps in (400, 20):
-        words = [f"scene.bouncing_ball.horizon={steps}", f"scene.bouncing_ball.dt={1 / steps}"]
-        (row,) = measured(
-            f"study=stability[fine_steps={1 << 12}]", "scenes=[bouncing_ball]", "contacts=[penalty]", "backends=[jax]",
-            "contact.penalty.stiffness=10", "integrators=[explicit_euler]", *words,
-        ).to_dict("records")  # fmt: skip
-        causes[steps] = row["cause"]
-        assert row["step_error"] + row["law_error"] >= row["relative_error"]  # the triangle over the law's gradient
-        assert row["law_error"] == pytest.approx(1.2, abs=0.02)  # as at 2^14 steps with semi-implicit Euler
-    assert causes == {400: "law", 20: "both"}
 
 
 def test_rigid_impacts_are_not_blamed_on_the_law():

@@ -1,9 +1,7 @@
 """What studies show of rows: nothing is folded that has parameters of its own, and every row says how to make it again."""
 
-import ast
 import re
 import shlex
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +10,6 @@ from bench.plugins.studies.stability import cells_of
 from bench.plugins.studies.twins import FLOOR
 from helpers import unmeasured
 
-import bench.report
 from bench.experiment import config
 from bench.experiment.axes import table
 from bench.experiment.columns import COMMON
@@ -87,14 +84,6 @@ def checked(*words):
     return given, rows.assign(verdict="smooth", **{name: [value] * len(rows) for name, value in values.items()})
 
 
-def test_two_integrators_are_two_lines_of_the_gradient_check():
-    given, rows = checked("scenes=[pendulum]", "integrators=[semi_implicit_euler,rk4]", "sweep.horizon=[1,10]")
-    found = readable(gradient_check.views(given, rows).tables[1])
-    assert list(found["integrator"]) == ["semi_implicit_euler", "rk4"] * 2
-    assert list(found["horizon [steps]"]) == ["1", "1", "10", "10"]
-    assert set(found["backends"]) == {"jax, torch"}
-
-
 def test_a_swept_parameter_keeps_lines_of_the_gradient_check_apart():
     given, rows = checked("scenes=[mass_spring]", "sweep.mass_spring.damping=[0,1,10]", "sweep.horizon=[2]")
     shown = gradient_check.views(given, rows)
@@ -120,27 +109,6 @@ def test_untrusted_undecided_and_missing_gradients_come_first_and_are_never_righ
 
 
 # ---------------------------------------------------------------------------------------------------- three_errors
-
-
-def erring(*words):
-    numbers = dict.fromkeys(("forward_error_rel", "program_error_rel", "model_error_rel", "model_cosine"), 0.5)
-    biases = {"bias": 0.1, "bias_rel": 0.1, "bias_low": 0.05, "bias_high": 0.2, "reference_norm": 1.0}
-    return unmeasured(
-        "study=three_errors", "backends=[jax]", "estimators=[fobg,reinforce]", *words, **numbers, **biases
-    )
-
-
-def test_the_main_chart_of_three_errors_is_along_the_time_step_where_it_is_swept():
-    """As in the standard experiment: the time step, stepping with the horizon, and parameters of the laws."""
-    words = ["scenes=[bounce_once]", "contacts=[penalty,softplus]", "bounce_once.dt=0.05", "bounce_once.horizon=20"]
-    sweep = "sweep.union=[{zip:{horizon:[10,20,40],dt:[0.1,0.05,0.025]}},{penalty.stiffness:[50,1000,10000]},{beta:[100,1000]}]"
-    given, rows = erring(*(f"scene.{word}" if word.startswith("bounce") else word for word in words), sweep)
-    drawn = given.study.views(given, rows).charts[0].frame
-    assert set(drawn["dt"]) == {0.025}
-    assert len(set(drawn["law"])) == 2
-    given, rows = erring("scenes=[bounce_once]", "contacts=[impulse,softplus]", "sweep.beta=[100,1000]")
-    drawn = given.study.views(given, rows).charts[0].frame
-    assert len(set(drawn["law"])) == 3, "every cell without a sweep of the step"
 
 
 # ------------------------------------------------------------------------------------------------------- stability
@@ -172,24 +140,7 @@ def test_maps_are_apart_by_parameters(words, maps):
     assert set(first.frame["problem"]) == {maps[0]}
 
 
-def test_a_share_is_not_named_after_a_parameter_that_varies_in_it():
-    given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[0,1]")
-    (line,) = given.study.views(given, rows).tables[0].frame.to_dict("records")
-    assert (line["scene"], line["step"]) == ("mass_spring", "semi_implicit_euler")
-
-
 # ---------------------------------------------------------------------------------------------- growth and twins
-
-
-def test_growth_keeps_noises_apart_and_joins_what_steps_with_the_horizon():
-    words = ["study=growth", "scenes=[double_integrator]", "estimators=[fobg]", "sweep.sigma=[0.1,0.2]"]
-    given, rows = unmeasured(*words, "sweep.zip.horizon=[10,20]", "sweep.zip.dt=[0.1,0.05]")
-    rows = rows.assign(gradient_median=1.0, time_horizon=rows["horizon"] * rows["dt"])
-    shown = given.study.views(given, rows)
-    assert dict(shown.rows["problem"].value_counts()) == {
-        "double_integrator, sigma=0.1": 2, "double_integrator, sigma=0.2": 2
-    }  # fmt: skip
-    assert list(readable(shown.tables[1])["sigma"]) == ["0.1", "0.1", "0.2", "0.2"]
 
 
 def test_twins_of_a_swept_scene_are_panels_of_their_own():
@@ -238,24 +189,6 @@ def test_a_study_without_a_page_gets_its_numbers_and_filters_by_what_varies(own)
     assert [(chart.x[0].name, chart.y[0].heading) for chart in views.charts] == [("mass", "weight [kg]")]
     assert data["filters"] == ["mass", "outcome"]
     assert data["cells"]["mass"] == [1, 2, 3]
-
-
-def test_verdicts_and_what_was_swept_can_be_filtered_by():
-    given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[0,1]")
-    rows.loc[0, "verdict"] = "inaccurate"
-    data = page_data(given, rows, views_of(given, rows), [[]] * len(rows))
-    assert data["filters"] == ["stiffness", "damping", "verdict"]
-
-
-def test_reports_name_no_plugin():
-    """Neither study nor plugin: what a report has to know of one it asks it."""
-    every = (entry for found in registry.entries().values() for entry in found.values() if entry.plugin)
-    names = {entry.name for entry in every if entry.plugin.__module__.startswith("bench.")}
-    here = Path(bench.report.__file__).parent
-    for path in here.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Constant) and isinstance(node.value, str):
-                assert node.value not in names, f"{path.name}, line {node.lineno}"
 
 
 # ---------------------------------------------------------------------------------------------------------- again

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bench.plugins.studies.three_errors import FLOOR, OWN, PARTS, TRAP, _signs, difference_check, traps
+from bench.plugins.studies.three_errors import OWN, PARTS, TRAP, _signs, difference_check, traps
 from classes import BouncingBall, Impulse, Jax, SemiImplicitEuler
 from helpers import unmeasured
 
@@ -51,26 +51,6 @@ def test_a_trap_is_exact_convergent_and_turned_away_or_no_nearer_at_every_step(c
     assert len(traps(Shown(given, typed, ["dt"], ["estimator"], PARTS))) == 3 * trapped
     found = given.study.show(given, typed)
     assert (set(found.charts[0].frame["series"]) == {OWN, TRAP}) == trapped
-
-
-def laws(model, program=(1e-12, 1e-12, 1e-12)):
-    """Three laws on two scenes with planted errors: ``model`` has the errors of a scene's laws."""
-    words = ["study=three_errors", "scenes=[bounce_once,bouncing_ball]", "contacts=[impulse,penalty,softplus]"]
-    return unmeasured(
-        *words, "backends=[jax]", "estimators=[fobg,reinforce]", bias=0.1, bias_rel=0.1, bias_low=0.0, bias_high=0.2,
-        reference_norm=1.0, model_error_rel=np.repeat(np.ravel(model), 2), program_error_rel=np.repeat([*program, *program], 2),
-    )  # fmt: skip
-
-
-def test_gradients_are_drawn_once_whatever_estimates_them_and_only_where_compared():
-    model = [[0.0, 3.0, np.nan], [0.5, 0.2, 0.05]]
-    given, rows = laws(model, (1e-12, 1e-12, np.nan))
-    found = given.study.show(given, rows)
-    drawn = found.charts[0].plotted()
-    zero = drawn[drawn["error"] == FLOOR]
-    assert list(zero["law"]) == ["impulse"]
-    assert zero["error_limit"].all()
-    assert drawn["error"].notna().all()
 
 
 def test_rounding_has_no_sign():

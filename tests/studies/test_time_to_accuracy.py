@@ -123,10 +123,10 @@ def test_a_bias_decides_whether_an_error_of_10_percent_is_reached(given, how):
         assert found.beyond == pytest.approx(0.4)
 
 
-@pytest.mark.parametrize("name", ["quadratic_model", "sobol", "orthogonal"])
-def test_samples_that_are_coupled_are_not_extrapolated(name):
+@pytest.mark.parametrize("given", [{"estimator": "quadratic_model"}, {"draws": "sobol"}])
+def test_samples_that_are_coupled_are_not_extrapolated(given):
     """The error of such an estimator need not fall as the root of 1 / N: only measured counts tell."""
-    curve = line(estimator=name)
+    curve = line(**given)
     beyond = required_cost(curve, 0.1, ROLLOUTS)
     assert (beyond.how, beyond.beyond) == ("unknown", 512)
     assert math.isnan(beyond.cost)
@@ -146,15 +146,15 @@ def slower(times, **values):
 
 def test_an_estimator_beyond_the_measured_samples_leaves_the_order_open():
     """The first takes 800 rollouts; the other has half the error at 256 samples, and more than 512 rollouts to go."""
-    found = entry(rows(), better(1 / 0.9, estimator="orthogonal"), width=1.01)
+    found = entry(rows(), better(1 / 0.9, estimator="quadratic_model"), width=1.01)
     names = tuple(found[["fastest", "next", "tied", "unknown"]])
-    assert names == ("e", "orthogonal", ("orthogonal",), "orthogonal")
+    assert names == ("e", "quadratic_model", ("quadratic_model",), "quadratic_model")
     assert limits(pd.DataFrame([found])) == ["not known"]
 
 
 def test_an_estimator_beyond_the_measured_samples_is_behind_one_that_needs_fewer():
     """A hundredth of the variance takes 4 samples for 0.1: measured at 16, and the other takes more than 512 rollouts."""
-    found = entry(better(3), rows(estimator="sobol"), width=1.01)
+    found = entry(better(3), rows(estimator="quadratic_model"), width=1.01)
     assert math.isnan(found["factor"])
     assert found["factor_low"] == pytest.approx(512 / (800 / 9), rel=0.05)
 
@@ -191,11 +191,9 @@ def test_an_error_far_above_all_variances_leaves_no_doubt_about_the_times():
     assert entry(*parts, width=50.0)["tied"] == ("slow",)
 
 
-def test_the_next_is_another_estimator_or_the_same_on_another_backend_by_time_alone():
+def test_the_next_is_another_estimator():
     parts = rows(), slower(2, backend="other")
-    assert list(entry(*parts, by="time", width=50.0)[["factor", "factor_low", "factor_high"]]) == pytest.approx(
-        [2.0] * 3
-    )
+    assert entry(*parts, by="time")["next"] == "-"
     assert entry(*parts, slower(3, estimator="slow"), by="time", width=1.1)["next"] == "slow on b"
 
 

@@ -1,10 +1,8 @@
 """Training with contact: what the log has of it, and any contact law on a backend with JAX's operations."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from classes import HopperRun
 from problems import environment, pressed_program
 
 from bench.model import State, registry
@@ -45,32 +43,3 @@ def test_a_contact_law_that_solves_an_equation_trains_on_the_implicit_backend():
     log, _ = updated("complementarity", "implicit")
     assert 0 < log["gradient_norm"] < np.inf
     assert np.isnan(log["contact_force"])
-
-
-@pytest.mark.full
-def test_shac_learns_to_run_by_hopping():
-    """A fifth of the steps of results/standard/train_hopper, whose shac runs 4 m/s; falling over gives a return below 100."""
-    env = environment(pressed_program(scene=HopperRun(), stiffness=1e4), dtype="float32")
-    trainer = registry.make("trainers", "shac", {"actor_rate": 0.002, "steps": 204_800})
-    run = Training(env, trainer)
-    state = run.start(0)
-    for _ in range(trainer.updates(env)):
-        state, _ = run.update(state)
-    numbers = np.random.default_rng(0).standard_normal((env.n_start, 64))
-    assert np.median(run.returns(state, numbers)) > 500
-
-    def step(episodes, _):
-        action = trainer.action(env, state, env.observe(episodes.state))
-        moved = env.step(episodes, action, jnp.zeros((env.n_start, 64), env.dtype))
-        return moved.next, (episodes.state.q, moved.ended)
-
-    first = env.start(jnp.asarray(numbers, "float32"))
-    _, (q, ended) = jax.lax.scan(step, first, None, length=env.length)
-    whole = ~np.asarray(ended)[:-1].any(axis=0)
-    q = np.asarray(q)[:, :, whole]
-    assert whole.sum() >= 16, "too few episodes of full length to count hops; their share differs between machines"
-    # a hop: foot and ground part by more than 2 cm and meet again
-    is_up = q[:, 4] > 0.02
-    hops = (is_up[:-1] & ~is_up[1:]).sum(axis=0)
-    assert np.median(q[-1, 0] - q[0, 0]) > 5.0
-    assert np.median(hops) > 5

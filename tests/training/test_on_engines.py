@@ -1,15 +1,13 @@
-"""Training on the steps of a physics engine: the transitions of MJX against MuJoCo's own, and derivatives of windows."""
+"""Training on the steps of a physics engine: the transitions of MJX against MuJoCo's own."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bench.plugins.studies.train.measure import slope_errors
 
 from bench.experiment.by_name import make
 from bench.model import compose
 from bench.training.environment import Environment
-from bench.training.run import Training
 
 mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("mujoco.mjx")
@@ -79,10 +77,3 @@ def test_a_transition_is_that_of_mujoco_with_bounded_controls(ball):
     assert float(depth[0]) == pytest.approx(-data.contact.dist.min(), abs=1e-7)
     assert np.isnan(force).all()
     np.testing.assert_allclose(np.concatenate(moved.reached)[:, 0], [*data.qpos, *data.qvel], rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_the_gradient_of_a_window_is_its_derivative(ball):
-    run = Training(ball[1], make("trainers", "shac[hidden=4,steps=400,rollouts=4,window=5,passes=2,batches=2]"))
-    state = run.start(0)
-    assert max(slope_errors(run, state)) < 1e-4

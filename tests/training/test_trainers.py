@@ -61,16 +61,6 @@ def test_a_run_that_is_stored_and_resumed_takes_the_same_path_bit_for_bit(name):
         assert np.asarray(a).dtype != np.float64, "a float32 run computes in float32"
 
 
-def test_seeds_give_different_runs_from_one_compilation():
-    run = training("shac", "float32")
-    first, second = run.start(0), run.start(1)
-    assert not np.array_equal(first.actor.mean.weights[0], second.actor.mean.weights[0])
-    run.update(first)
-    seconds = run.compile_s
-    run.update(second)
-    assert run.compile_s == seconds
-
-
 @pytest.mark.slow
 def test_the_first_step_of_sep_cma_es_is_the_diagonal_of_that_of_cma_es():
     """From equal variances both draw the same points; learning rates of the variances differ by (d + 2) / 3."""
@@ -92,11 +82,7 @@ def test_the_first_step_of_sep_cma_es_is_the_diagonal_of_that_of_cma_es():
 
 WRONG = {
     "none": lambda g: g,
-    "sign": lambda g: -g,
-    "ten times": lambda g: 10.0 * g,
-    "noise": lambda g: jnp.linalg.norm(g) / g.size**0.5 * jax.random.normal(jax.random.PRNGKey(0), g.shape),
     "half of the units": lambda g: g.at[::2].set(0.0),
-    "nothing": jnp.zeros_like,
 }
 
 
@@ -114,9 +100,7 @@ class Planted(Shac):
         return optax.chain(plant, super().actor_optimizer(env))
 
 
-@pytest.mark.parametrize(
-    "fault", [fault if fault == "noise" else pytest.param(fault, marks=pytest.mark.slow) for fault in WRONG]
-)
+@pytest.mark.parametrize("fault", ["half of the units", pytest.param("none", marks=pytest.mark.slow)])
 def test_a_layer_that_moves_along_a_wrong_gradient_is_named(fault):
     env = environment(cartpole_program(horizon=12, substeps=1))
     exact = Training(env, Planted(**TRAINERS["shac"], fault=fault))
@@ -199,27 +183,6 @@ def test_the_critic_of_ppo_stays_within_the_returns_that_rewards_allow():
         state, log = run.update(state)
         largest = max(largest, -float(log["reward"]))
     assert float(log["value_loss"]) < (largest / (1 - run.trainer.discount)) ** 2
-
-
-# a half and a quarter of the steps of results/standard/train. An independent PPO ended at -631 and -647
-SWING_UP = {
-    "shac": ({"rollouts": 64, "window": 32, "passes": 16, "batches": 4, "steps": 512_000}, -800),
-    "ppo": ({"rollouts": 8, "window": 256, "passes": 10, "batches": 32, "steps": 256_000}, -700),
-}
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param("shac", marks=pytest.mark.full), pytest.param("ppo", marks=pytest.mark.slow)]
-)
-def test_a_trainer_swings_the_cartpole_up(name):
-    """From about -2,000 for hanging still."""
-    parameters, level = SWING_UP[name]
-    run = training(name, "float32", horizon=240, substeps=4, hidden=64, **parameters)
-    numbers = np.random.default_rng(0).standard_normal((8, 256))
-    state = run.start(0)
-    for _ in range(run.trainer.updates(run.env)):
-        state, _ = run.update(state)
-    assert run.returns(state, numbers).mean() > level
 
 
 @pytest.mark.slow

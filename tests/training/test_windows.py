@@ -102,17 +102,6 @@ def test_the_return_of_a_window_restarts_at_an_end_with_the_value_of_the_state_b
 
 
 @pytest.mark.slow
-def test_a_cut_stops_the_gradient_where_the_jacobian_is_too_large(actor):
-    env, key = environment(), jax.random.PRNGKey(2)
-    free = window_return(env, actor, 8, key)[1]
-    always = window_return(env, actor, 8, key, cut=1e-9)[1]
-    never = window_return(env, actor, 8, key, cut=1e9)[1]
-    assert np.asarray(always.cut).all()
-    assert not np.asarray(never.cut).any()
-    np.testing.assert_array_equal(free.reward, always.reward)
-
-
-@pytest.mark.slow
 def test_the_gradient_of_an_episode_in_windows_is_the_sum_of_theirs(actor):
     """By a loop over windows whose first states are constants: rewards and the last value, times gamma^steps before."""
     env, key, length, every, discount = environment(), jax.random.PRNGKey(2), 10, 4, 0.9

@@ -25,7 +25,6 @@ WORKS, FAILS, OPEN, NO_RESULT = "works", "fails", "open", "no result"
 has no number."""
 NEAR = 2.0
 """A method whose error is more than this many times the lowest does not share the first place: the order is open."""
-EQUAL = "relative RMSE at equal rollouts"
 SAME_COST = 1.05
 """Costs within this factor count as equal: a call at w = 0 that all samples share makes 101 rollouts of 100."""
 FASTEST = 2.0
@@ -39,7 +38,6 @@ COLUMNS = (
     text("problem", "what distinguishes the problem from the others"),
     text("axis", "the swept quantity along which the problem is reported"),
     Column("at", "its value", format="setting"),
-    text("basis", "what is compared: the error at equal rollouts, or the cost of reaching an error"),
     Column(
         "rollouts",
         "rollouts of one estimate at which errors are compared; a gradient counts as the rollouts that take as long",
@@ -55,6 +53,7 @@ COLUMNS = (
     text("not_comparable", "methods whose error at these rollouts is not known"),
 )
 """The columns of the table of comparisons."""
+SETTING = ["setting", "problem", "axis", "at", "rollouts"]
 ERROR, VALUE, FACTOR = ([f"{name}{end}" for end in ("", "_low", "_high")] for name in ("error", "value", "factor"))
 
 
@@ -221,47 +220,49 @@ def ratio(first: Any, second: Any) -> tuple[Any, Any, Any]:
 
 
 def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
-    """Return a line per setting: the method of lowest error, the next estimator, their factor, and ties.
+    """Return a line per setting: the method of lowest error, the next estimator, their factor, ties, and leaders.
 
     Methods whose error is not known, or whose interval is not, cannot be first, nor can those with an upper limit only. A
     method is tied with the first unless the interval of their factor lies above 1. No method is first where upper limits
-    of others lie below its interval: these are tied. Nor is one with which no other can be compared.
+    of others lie below its interval: these are tied. Nor is one with which no other can be compared. ``leaders`` are the
+    first and those tied with it whose error is near.
     """
-    missing = methods[methods["not_comparable"]].groupby("setting", sort=False)["method"].agg(tuple)
-    good = methods[np.isfinite(methods[["error", "error_low"]]).all(axis=1)].sort_values("error", kind="stable")
-    lowest = good[~good["error_is_limit"]].drop_duplicates("setting")
-    first = lowest.set_index("setting")
-    least = good["setting"].map(first["error_low"]).astype(float).fillna(math.inf)
-    lower = good[good["error_is_limit"] & (good["error"] < least)]
-    is_alone = ~first.index.isin(good.loc[good.duplicated("setting"), "setting"]) & first.index.isin(missing.index)
-    first = first[~first.index.isin(lower["setting"]) & ~is_alone]
-    others = good.drop(lowest.index).merge(first, on="setting", suffixes=("", "_of_first"))
-    factors = ratio(*([others[f"{end}{of}"] for end in ERROR] for of in ("_of_first", "")))
-    factors = (np.where(others["error_is_limit"], math.nan, factors[0]), *factors[1:])
-    others = others.assign(
-        same=others["estimator"] == others["estimator_of_first"], **dict(zip(FACTOR, factors, strict=True))
-    )
-    second = others.sort_values("same", kind="stable").drop_duplicates("setting").set_index("setting")
-    tied = pd.concat([others[~(others["factor_low"] > 1)], lower]).groupby("setting", sort=False)["method"].agg(tuple)
-    lines = methods.drop_duplicates("setting").set_index("setting")[["problem", "axis", "at", "rollouts"]].assign(
-        basis=EQUAL, not_comparable=missing, first=first["method"], **{name: first[error] for name, error in zip(VALUE, ERROR, strict=True)},
-        second=second["method"], **{name: second[name] for name in FACTOR}, tied=tied,
-    )  # fmt: skip
-    for name in ("tied", "not_comparable"):
-        lines[name] = [names if isinstance(names, tuple) else () for names in lines[name]]
-    return lines.fillna({"first": "", "second": ""}).reset_index()
+    names = [*SETTING, "not_comparable", "first", *VALUE, "second", *FACTOR, "tied", "leaders"]
+    lines = [_compared(level) for _, level in methods.groupby("setting", sort=False)]
+    return pd.DataFrame(lines, columns=names)
 
 
-def leaders(comparisons: pd.DataFrame, methods: pd.DataFrame) -> pd.Series:
-    """Return, per setting, the methods that are first, or tied and near the first; settings without a known error have none."""
-    named = (
-        comparisons.assign(method=[(line.first, *line.tied) for line in comparisons.itertuples()])
-        .explode("method")
-        .astype({"method": object})
-    )
-    near = named.merge(methods[["setting", "method", "error"]], on=["setting", "method"])
-    near = near[~(near["error"] > NEAR * near["value"])]
-    return near.groupby("setting", sort=False)["method"].agg(tuple)
+def _compared(level: pd.DataFrame) -> dict[str, Any]:
+    """Return the line of the methods at one setting."""
+    good = level[np.isfinite(level[["error", "error_low"]]).all(axis=1)].sort_values("error", kind="stable")
+    known, missing = good[~good["error_is_limit"]], tuple(level.loc[level["not_comparable"], "method"])
+    lower = good[good["error_is_limit"] & (good["error"] < min(known["error_low"].iloc[:1], default=math.inf))]
+    line = {
+        **level.iloc[0][SETTING],
+        "not_comparable": missing,
+        "first": "",
+        "second": "",
+        "tied": (),
+        "leaders": tuple(lower["method"]),
+    }
+    if known.empty or len(lower) or (missing and len(good) == 1):
+        return line | {"tied": line["leaders"]}
+    first, others = known.iloc[0], good.drop(known.index[0])
+    line |= {"first": first["method"], "leaders": (first["method"],), **dict(zip(VALUE, first[ERROR], strict=True))}
+    if others.empty:
+        return line
+    factors = np.array(ratio(first[ERROR], others[ERROR].to_numpy(float).T))
+    factors[0, others["error_is_limit"]] = math.nan
+    # the next of another estimator, where there is one
+    second = int(np.argmax(others["estimator"] != first["estimator"]))
+    tied = others[~(factors[1] > 1)]
+    near = tied.loc[~(tied["error"] > NEAR * first["error"]), "method"]
+    line |= {
+        "second": others["method"].iloc[second],
+        "tied": tuple(tied["method"]),
+        "leaders": (first["method"], *near),
+    }
+    return line | dict(zip(FACTOR, factors[:, second], strict=True))
 
 
 def verdicts_by_estimator(methods: pd.DataFrame) -> pd.DataFrame:

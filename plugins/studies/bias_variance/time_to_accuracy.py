@@ -81,9 +81,9 @@ class RequiredCost:
     """``measured``, ``at once``, ``extrapolated``, ``never`` or ``unknown``."""
     cost: float = math.nan
     samples: float = math.nan
-    down: float = math.nan
+    down: float = 0.0
     """Log of cost over the lower end of its 95% interval; infinite where the variance has no interval."""
-    up: float = math.nan
+    up: float = 0.0
     """Log of the upper end over the cost; infinite where it is not certain that the error is reached."""
     beyond: float = math.inf
     """A cost that is not known exceeds this one: that of the most samples measured, or that of an estimate without bias.
@@ -130,21 +130,17 @@ def _at_interval_end(rows: pd.DataFrame, end: str) -> pd.DataFrame:
     return rows.assign(bias=bias, variance=rows[f"variance_{end}"], rmse_rel=np.maximum(error, LEAST))
 
 
-def lead(first: RequiredCost, second: RequiredCost, alike: bool = False) -> tuple[float, float, float]:
+def lead(first: RequiredCost, second: RequiredCost) -> tuple[float, float, float]:
     """Return the ratio of the second cost to the first, and the ends of its 95% interval.
 
-    ``alike`` means the same estimator on two backends: only the noise of timing counts. Where only a lower limit is
-    known, the ratio is NaN and the upper end infinite.
+    Where only a lower limit is known, the ratio is NaN and the upper end infinite.
     """
-    noise = (first.times, second.times)
-    if second.how == "unknown":
-        return math.nan, second.beyond / first.cost * math.exp(-math.hypot(first.up, *noise)), math.inf
-    factor = second.cost / first.cost
-    low = math.hypot(*noise) if alike else math.hypot(first.up, second.down, *noise)
-    if not alike and first.how == "at once" and first.down > 0:
-        return math.nan, factor * math.exp(-low), math.inf
-    high = math.hypot(*noise) if alike else math.hypot(first.down, second.up, *noise)
-    return factor, factor * math.exp(-low), factor * math.exp(high)
+    is_known, noise = math.isfinite(second.cost), (first.times, second.times)
+    factor = (second.cost if is_known else second.beyond) / first.cost
+    low = factor * math.exp(-math.hypot(first.up, second.down, *noise))
+    if not is_known or (first.how == "at once" and first.down > 0):
+        return math.nan, low, math.inf
+    return factor, low, factor * math.exp(math.hypot(first.down, second.up, *noise))
 
 
 def _required_cost(rows: pd.DataFrame, target: float, cost: str) -> RequiredCost:
@@ -217,44 +213,36 @@ def estimator_of(method: str) -> str:
 
 
 def line(problem: ProblemRows, target: float, kind: str) -> dict[str, Any]:
-    """Return a line of the table: the cheapest method, the next (if possible of another estimator), and excluded ones."""
-    reached = methods(problem, target, COSTS[kind])
-    ranked = sorted((r.cost, name) for name, r in reached.items() if math.isfinite(r.cost))
-    numbers = ("cost", "samples", "how", "next", "factor", "factor_low", "factor_high")
-    entry = {"fastest": "-"} | dict.fromkeys(numbers, math.nan) | {"how": "-", "next": "-", "tied": ()}
-    if ranked:
-        first = ranked[0][1]
-        best = reached[first]
-        entry |= {"fastest": first, "cost": best.cost, "samples": math.ceil(best.samples), "how": best.how}
-        entry |= _following(first, [name for _, name in ranked[1:]], reached)
+    """Return a line of the table: the cheapest method, the next of another estimator, and excluded ones."""
+    reached = methods(problem, target, COSTS[kind]) or {"-": RequiredCost("never")}
+    first = min(reached, key=lambda name: (order(reached[name])[0], name))
+    best, by_how = (
+        reached[first],
+        {how: [n for n, r in reached.items() if r.how == how] for how in ("never", "unknown")},
+    )
+    entry = {"problem": problem.title(), "relative error": target, "by": kind, "fastest": first, "cost": best.cost}
+    if math.isfinite(best.cost):
+        entry |= {"samples": math.ceil(best.samples), "how": best.how}
     else:
-        entry["how"] = "not known" if any(r.how == "unknown" for r in reached.values()) else "never"
-    out = {how: ", ".join(name for name, r in reached.items() if r.how == how) or "-" for how in ("never", "unknown")}
-    return {"problem": problem.title(), "relative error": target, "by": kind, **entry, **out}
+        entry |= {"fastest": "-", "samples": math.nan, "how": "not known" if by_how["unknown"] else "never"}
+    return entry | _following(first, reached) | {how: ", ".join(names) or "-" for how, names in by_how.items()}
 
 
-def _following(first: str, known: list[str], reached: dict[str, RequiredCost]) -> dict[str, Any]:
-    """Return the next method after the first, the factor between them, and the methods that may be as cheap.
+def _following(first: str, reached: dict[str, RequiredCost]) -> dict[str, Any]:
+    """Return the next method of another estimator than the first, their factor, and all that may be as cheap.
 
     A method whose cost is not known is the next if it may be cheaper than the next of known cost.
     """
-    best = reached[first]
-    unknown = [name for name, r in reached.items() if r.how == "unknown" and math.isfinite(r.beyond)]
-    others = [name for name in (*known, *unknown) if estimator_of(name) != estimator_of(first)]
-    leads = {name: lead(best, reached[name]) for name in others}
-    if not others:
-        if not known:
-            return {}
-        leads = {known[0]: lead(best, reached[known[0]], alike=True)}
-    tied = tuple(name for name, factors in leads.items() if not factors[1] > 1.0)
-    ranked = [name for name in leads if name in known]
-    following = ranked[0] if ranked else min(leads, key=lambda name: leads[name][1])
-    factor, low, high = leads[following]
-    nearer = [name for name in leads if name in unknown and leads[name][1] < (low if math.isnan(factor) else factor)]
-    if nearer:
-        following = min(nearer, key=lambda name: leads[name][1])
-        factor, low, high = math.nan, min(low, leads[following][1]), math.inf
-    return {"next": following, "factor": factor, "factor_low": low, "factor_high": high, "tied": tied}
+    leads = {
+        name: lead(reached[first], needed)
+        for name, needed in sorted(reached.items(), key=lambda item: order(item[1])[0])
+        if math.isfinite(reached[first].cost) and needed.how != "never" and min(order(needed)[:2]) < math.inf
+        and estimator_of(name) != estimator_of(first)
+    }  # fmt: skip
+    least = {name: low if math.isnan(factor) else factor for name, (factor, low, _) in leads.items()}
+    following = min(leads, key=least.__getitem__, default="-")
+    numbers = zip(("factor", "factor_low", "factor_high"), leads.get(following, (math.nan,) * 3), strict=True)
+    return {"next": following, **dict(numbers), "tied": tuple(n for n, (_, low, _) in leads.items() if not low > 1.0)}
 
 
 def accuracy_table(best: pd.DataFrame) -> Table:
@@ -282,15 +270,3 @@ def limits(table: pd.DataFrame) -> list[str]:
         "" if not (math.isnan(factor) and high == math.inf) else f"at least {number(low)}" if low > 1.0 else "not known"
         for factor, low, high in factors
     ]
-
-
-def comparisons(best: pd.DataFrame) -> pd.DataFrame:
-    """Return the lines of the table of comparisons: who reaches an error first, and by what factor."""
-    return pd.DataFrame({
-        "problem": best["problem"], "axis": "", "at": math.nan,
-        "basis": [f"{by} to {target:.0%}" for by, target in zip(best["by"], best["relative error"], strict=True)],
-        "first": best["fastest"].where(best["fastest"] != "-", ""), "value": best["cost"],
-        "value_low": math.nan, "value_high": math.nan, "second": best["next"].where(best["next"] != "-", ""),
-        "factor": best["factor"], "factor_low": best["factor_low"], "factor_high": best["factor_high"],
-        "tied": best["tied"], "rollouts": math.nan, "not_comparable": [()] * len(best),
-    })  # fmt: skip

@@ -31,7 +31,6 @@ from .comparisons import (
     WORKS,
     at_equal_rollouts,
     compare_errors,
-    leaders,
     lowest,
     method_table,
     problems_by_axis,
@@ -113,9 +112,8 @@ def tables(
     """Return all tables; ``equal`` has the methods at equal rollouts, ``best`` is the table of the cost to reach an error."""
     main, *others = pivots(shown, lowest(equal))
     is_ranked = methods["estimator"].nunique() >= LEAST and methods["problem"].nunique() > 1
-    compared = errors if best.empty else pd.concat([errors, time_to_accuracy.comparisons(best)], ignore_index=True)
-    names = {name: compared[name].map(", ".join) for name in ("tied", "not_comparable")}
-    joined = compared.drop(columns="setting").assign(**names)
+    names = {name: errors[name].map(", ".join) for name in ("tied", "not_comparable")}
+    joined = errors.drop(columns=["setting", "leaders"]).assign(**names)
     columns = [replace(c, note="factor_note") if c.name == "factor" else c for c in COMPARED]
     title = "the first and the next at each setting, at equal rollouts"
     return [
@@ -133,8 +131,7 @@ def tables(
 COMPARISON_NOTES = (
     "Rollouts: of one estimate of each method, the number at which most methods are known, as measured or by RMSE^2 = bias^2 + v / N; "
     "a gradient counts as the rollouts that take as long (as one where that was not measured). Not comparable: methods that "
-    "choose samples together, or whose bias may depend on their number, at other rollouts than measured. Costs by time to "
-    "reach an error are compared where samples were swept. Factor: the second over the first, with its 95% interval; none for an upper limit, which is never first. Tied: not "
+    "choose samples together, or whose bias may depend on their number, at other rollouts than measured. Factor: the second over the first, with its 95% interval; none for an upper limit, which is never first. Tied: not "
     "distinguishable from the first, since the interval of the factor reaches 1 or is not known.",
 )
 
@@ -289,7 +286,7 @@ def recommendations(methods: pd.DataFrame) -> Table:
     methods = methods.assign(failed=methods["verdict"].isin((FAILS, NO_RESULT)))
     now = verdict(methods["status"], *(methods[name] for name in ERROR))
     good = methods[(now == WORKS) & ~methods["failed"]]
-    use = methods["setting"].map(leaders(compare_errors(good), good)).astype(object)
+    use = methods["setting"].map(compare_errors(good).set_index("setting")["leaders"]).astype(object)
     is_lost = methods.groupby("setting")["failed"].transform("all")
     missing = is_lost.map({True: ("none works",), False: ("none is known to work",)})
     lines = [

@@ -58,56 +58,47 @@ def judge(run: Mapping[str, Any]) -> list[Verdict]:
 
     What noise can explain does not count: means are compared by a test, and evaluations need their intervals apart.
     """
-    updates = series(run["log_update"])
-    log = {name: series(run[f"log_{name}"]) for name in LOGGED}
-    norms, tenth = log["gradient_norm"], max(len(updates) // 10, 1)
-    found: dict[str, Verdict] = {}
-
-    def check(code: str, is_fault: Any, value: Any, where: Any = None) -> None:
-        if is_fault:
-            found[code] = {"code": code, "value": float(value)}
-            if where is not None:
-                found[code]["update"] = int(where)
-
-    for name in FINITE:
-        bad = np.flatnonzero(~np.isfinite(log[name]))
-        check("not_finite", bad.size, math.nan, updates[bad[:1]].sum())
-    if len(norms) and np.isfinite(norms).all():
-        zero = run["gradient_zero"] if math.isfinite(run["gradient_zero"]) else float((norms == 0).mean())
-        check("zero", zero > SILENT, zero, updates[np.argmin(norms)])
-        usual, late = float(np.quantile(norms, USUAL)), float(np.median(norms[-tenth:]))
-        check("explodes", norms.max() > PEAK * usual > 0, norms.max() / max(usual, 1e-300), updates[np.argmax(norms)])
-        first = float(norms[: max(int((updates <= FIRST).sum()), 1)].min())
-        check("grows", late > FACTOR * first > 0, late / max(first, 1e-300), updates[np.argmax(norms > FACTOR * first)])
-        early = float(np.median(norms[:tenth]))
-        small = updates[np.flatnonzero(norms >= early / FACTOR)[-1]]
-        has_vanished = 0 < late < early / FACTOR and small < updates[-tenth] and not _rises(run, small)
-        check("vanishes", has_vanished, late / early if early else math.nan, small)
-    errors = _known(run["slope_errors"])
-    check("differences", errors.max(initial=0.0) > DISAGREES, errors.max(initial=0.0))
-    cosines = _known(run["cosine"])
-    check(
-        "opposed", len(cosines) >= MIN_CHECKS and mean_interval(cosines)[2] < 0, cosines.mean() if len(cosines) else 0.0
-    )
+    log = {name: series(run[f"log_{name}"]) for name in ("update", *LOGGED)}
+    bad = [log["update"][at] for name in FINITE for at in np.flatnonzero(~np.isfinite(log[name]))[:1]]
+    # what a trainer does not log is NaN, which is no fault
+    nothing = np.full(max(log["update"].size, 1), math.nan)
+    known = {name: values if values.size else nothing for name, values in log.items()}
+    updates, norms, largest = known["update"], known["gradient_norm"], known["parameter_largest"]
+    reward, depth, deviation = known["reward"], known["penetration"], known["deviation"]
+    tenth = max(len(updates) // 10, 1)
+    early, late, usual = np.median(norms[:tenth]), np.median(norms[-tenth:]), np.quantile(norms, USUAL)
+    first = norms[: max((updates <= FIRST).sum(), 1)].min()
+    silent = run["gradient_zero"] if math.isfinite(run["gradient_zero"]) else (norms == 0).mean()
+    small = updates[norms >= early / FACTOR].max(initial=0.0)
+    has_vanished = 0 < late < early / FACTOR and small < updates[-tenth:][0] and not _rises(run, small)
+    error, cosines = _known(run["slope_errors"]).max(initial=0.0), _known(run["cosine"])
     mean, low, high = (np.asarray(run[f"curve_return{end}"], dtype=float) for end in ("", "_low", "_high"))
-    if np.isfinite(mean).any():
-        # the last return is far below the best one, whatever the loss does
-        best = int(np.nanargmax(mean))
-        lost = mean[best] - mean[-1]
-        is_lost = high[-1] < low[best] and lost > LOST * (mean[best] - mean[0])
-        check("falls", is_lost, lost, run["curve_update"][best])
-    reward, depth = log["reward"], log["penetration"]
-    if len(depth) >= 3 * tenth and tenth > 1 and depth[:tenth].mean() > 0:
-        factor = depth[-tenth:].mean() / depth[:tenth].mean()
-        is_used = _is_below(reward[:tenth], reward[-tenth:]) and _is_below(depth[:tenth], depth[-tenth:])
-        check("soft_contact", is_used and factor > DOUBLED, factor)
-    largest, deviation = log["parameter_largest"], log["deviation"]
-    if len(largest):
-        check("parameters", largest.max() > GROWN * largest[0], largest.max() / largest[0],
-              updates[np.argmax(largest > GROWN * largest[0])])  # fmt: skip
+    best = np.argmax(np.nan_to_num(mean, nan=-math.inf))
+    lost = mean[best] - mean[-1]
     outside = np.flatnonzero((deviation < DEVIATIONS[0]) | (deviation > DEVIATIONS[1]))
-    check("deviation", outside.size, deviation[outside[:1]].sum(), updates[outside[:1]].sum())
-    return [found[code] for code in MEANINGS if code in found]
+    with np.errstate(all="ignore"):
+        deeper = depth[-tenth:].mean() / depth[:tenth].mean()
+        is_used = tenth > 1 and DOUBLED < deeper < math.inf and all(
+            _is_below(values[:tenth], values[-tenth:]) for values in (reward, depth)
+        )  # fmt: skip
+        faults = {
+            "not_finite": (bad, math.nan, bad[-1:]),
+            "zero": (np.isfinite(norms).all() and silent > SILENT, silent, updates[[norms.argmin()]]),
+            "explodes": (norms.max() > PEAK * usual > 0, norms.max() / usual, updates[[norms.argmax()]]),
+            "grows": (late > FACTOR * first > 0, late / first, updates[norms > FACTOR * first]),
+            "vanishes": (has_vanished, late / early, [small]),
+            "differences": (error > DISAGREES, error, []),
+            "opposed": (len(cosines) >= MIN_CHECKS and mean_interval(cosines)[2] < 0, cosines.sum() / len(cosines), []),
+            # the last return is far below the best one, whatever the loss does
+            "falls": (high[-1] < low[best] and lost > LOST * (mean[best] - mean[0]), lost, [run["curve_update"][best]]),
+            "soft_contact": (is_used, deeper, []),
+            "parameters": (largest.max() > GROWN * largest[0], largest.max() / largest[0], updates[largest > GROWN * largest[0]]),
+            "deviation": (outside.size, deviation[outside[:1]].sum(), updates[outside]),
+        }  # fmt: skip
+    return [
+        {"code": code, "value": float(value)} | ({"update": int(where[0])} if len(where) else {})
+        for code, (is_fault, value, where) in faults.items() if is_fault
+    ]  # fmt: skip
 
 
 def series(values: Any) -> np.ndarray:
