@@ -173,7 +173,7 @@ def page():
 
 
 def main(words):
-    """Run the command line and return the exit status: 1 if an answer is not that of the truth, or nothing was installed."""
+    """Run the command line and return the exit status: 1 if an answer is not that of the truth, nor as stored, or pip fails."""
     match words:
         case ["report", name, place]:
             report(name, place)
@@ -191,12 +191,14 @@ def _one(verb, name):
         if verb == "install":
             install(name)
             return 0
-        word = agreement(about(name), row := examine(name))
+        facts, place = about(name), REPORTS / f"{name}.json"
+        known = agreement(facts, json.loads(place.read_text())) if place.exists() else "agrees"
+        word = agreement(facts, row := examine(name))
     except UserError as error:
         print(f"{name}: {error}", flush=True)
         return 1
     print(f"{name}: {word}. {row.get('conclusion') or row['reason']} {row.get('noise', '')}", flush=True)
-    return int(word not in ("agrees", "open", "unavailable"))
+    return int(word not in (known, "agrees", "open", "unavailable"))
 
 
 if __name__ == "__main__":

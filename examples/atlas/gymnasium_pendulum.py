@@ -7,7 +7,7 @@ about = {
     "package": "gymnasium",
     "python": "bench",
     "requires": "gymnasium",
-    "examine": "sigma=0.01 calls=3000",
+    "examine": "sigma=0.01 calls=2000",
     "derivative": "none given",
     "how": "the published equations",
 }
