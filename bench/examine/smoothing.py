@@ -143,10 +143,10 @@ def measure_smoothed(
     seed: int = 0,
     pairs: int = PAIRS,
     unseen: Callable[[int], tuple[float, float]] | None = None,
-) -> Smoothed | None:
+) -> Smoothed:
     """Return the gradient's bias and the methods' costs under noise ``spread * u`` on theta, called ``sigma``.
 
-    None where the time is too short for :data:`FEWEST` pairs. ``plain (d,)`` is the gradient at theta without noise, if
+    Raises :class:`OutOfTime` where the time is too short for :data:`FEWEST` pairs. ``plain (d,)`` is the gradient at theta without noise, if
     it is known to be right. At most ``pairs`` pairs are drawn. ``unseen`` is the part of ``sigma * grad J`` that a number of
     draws may miss.
     """
@@ -161,7 +161,9 @@ def measure_smoothed(
                 break
             size *= 2
     except OutOfTime:
-        pass
+        if result is None:
+            raise
+    assert result is not None
     return result
 
 

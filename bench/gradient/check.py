@@ -379,7 +379,7 @@ class _Checker:
             if twice and finding.verdict == "unsettled" and self._gradient is not None:
                 better = settle(self.cost, line.theta, line.vector, line.length, measured[m], self._tangent)
                 findings[m] = better or finding
-        apart = [abs(f.difference - s.derivative) for f, s in zip(findings, measured, strict=True)] * lengths
+        apart = lengths * [abs(f.difference - s.derivative) for f, s in zip(findings, measured, strict=True)]
         wrong = [m for m, finding in enumerate(findings) if finding.verdict == "wrong_adjoint"]
         if (apart[wrong] <= LOOSE * whole[:, wrong].max(axis=0)).all():  # no solver excuses one that is plainly wrong
             for m in wrong:
