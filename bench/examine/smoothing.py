@@ -72,16 +72,16 @@ class Smoothed:
     norm: float
     """|grad J|, with the contribution of noise subtracted."""
     pairs: int
-    bias: float
+    bias: float = math.nan
     """|E program's gradient - grad J|, with the contribution of noise subtracted; NaN without a gradient."""
-    bias_low: float
-    bias_high: float
+    bias_low: float = math.nan
+    bias_high: float = math.nan
     """The 95% interval of the bias."""
-    moved: float
+    moved: float = math.nan
     """|grad J - grad cost| at theta, the effect of smoothing; NaN without a right gradient."""
-    remark: str
+    remark: str = ""
     """Why the intervals may be too narrow; empty if there is no such reason."""
-    methods: tuple[Method, ...]
+    methods: tuple[Method, ...] = ()
     n_moved: int = 0
     """Number of pairs whose costs differ."""
     n_lost: int = 0
@@ -199,8 +199,7 @@ def _summary(
     plain = None if plain is None else plain[noisy]
     if not np.isfinite(d).all():
         share = f"{int((~np.isfinite(d)).sum())} of {pairs} pairs have a cost that is not a number"
-        nothing = np.full(dim, np.nan)
-        return Smoothed(sigma, nothing, math.inf, math.nan, pairs, math.nan, math.nan, math.nan, math.nan, share, ())
+        return Smoothed(sigma, np.full(dim, np.nan), math.inf, math.nan, pairs, remark=share)
     # in units of the largest sigma: an input's share of the bias is by how much it moves the cost under its own noise
     weight = (spread / spread.max())[:, None]
     up, down = weight * up, weight * down

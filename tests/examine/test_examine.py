@@ -172,7 +172,7 @@ def test_lines_find_jump_and_kink_where_they_are_and_none_in_rounding():
     line = scan(lambda t: (t > 0.37) * 0.2 + abs(t + 0.81) + np.sin(3 * t), np.ones(1), noise=1e-15)
     assert [(b.kind, round(b.at, 3)) for b in line.breaks] == [("kink", -0.81), ("jump", 0.37)]
     assert line.jumps[0].size == pytest.approx(0.2, rel=1e-3)
-    assert line.kinks[0].size == pytest.approx(2.0, rel=1e-2)
+    assert line.breaks[0].size == pytest.approx(2.0, rel=1e-2)
     rough = np.random.default_rng(0)
     assert not scan(lambda t: 1e-9 * rough.standard_normal(t.size), np.ones(1), noise=1e-9).breaks
 
