@@ -103,8 +103,8 @@ class Part(Finding):
     def distance(self) -> float:
         """|program - difference| over the difference; infinite where that is not a number."""
         with np.errstate(all="ignore"):
-            apart = float(np.float64(abs(self.program - self.difference)) / np.float64(abs(self.difference)))
-        return float("inf") if np.isnan(apart) else apart
+            apart = np.abs(self.program - np.float64(self.difference)) / np.abs(self.difference)
+        return float("inf") if np.isnan(apart) else float(apart)
 
     @property
     def ratio_with_error(self) -> Ratio:
