@@ -194,8 +194,8 @@ def _summary(
     # an input without noise has no smoothed derivative
     noisy = spread > 0
     spread, dim = spread[noisy], int(noisy.sum())
-    u, d = drawn[:size][noisy], drawn[size]
-    up, down = drawn[size + 1 : 2 * size + 1][noisy], drawn[2 * size + 1 :][noisy]
+    d = drawn[size]
+    u, up, down = (drawn[first : first + size][noisy] for first in (0, size + 1, 2 * size + 1))
     plain = None if plain is None else plain[noisy]
     if not np.isfinite(d).all():
         share = f"{int((~np.isfinite(d)).sum())} of {pairs} pairs have a cost that is not a number"
@@ -203,8 +203,8 @@ def _summary(
     # in units of the largest sigma: an input's share of the bias is by how much it moves the cost under its own noise
     weight = (spread / spread.max())[:, None]
     up, down = weight * up, weight * down
-    terms = weight * d * u / spread[:, None]
-    groups = _means(weight * _terms(u, d) / spread[:, None])
+    terms = d * u / spread.max()
+    groups = _means(_terms(u, d) / spread.max())
     truth = groups.mean(axis=0)
     error = float(np.sqrt(groups.var(axis=0, ddof=1).sum() / GROUPS))
     norm = math.sqrt(max(float(truth @ truth) - error**2, 0.0))
