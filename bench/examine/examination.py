@@ -27,8 +27,6 @@ from bench.simulator.clock import Clock, OutOfTime, parse_duration
 from bench.simulator.simulator import Simulator
 from bench.simulator.tree import ParameterTree
 
-GENERATED_SUFFIX = re.compile(r"_[0-9a-f]{8}$")
-"""Suffix of the generated name of a module that is loaded from a file."""
 TOLERANCE = 1e-4
 """Default relative error of a derivative below which it only causes a warning."""
 COMPILE_S = 300.0
@@ -198,12 +196,10 @@ def _takes_steps(function: Callable[..., Any]) -> bool:
 
 
 def _function_name(function: Any) -> str:
-    """Return the name of a function, such as ``mysim.cost``, or of the library that differentiates."""
+    """Return the name of a function, without brackets, or of the library that differentiates."""
     if function is None or isinstance(function, str):
         return function or ""
-    module = GENERATED_SUFFIX.sub("", getattr(function, "__module__", "") or "")
-    name = re.sub(r"<locals>\.|[<>]", "", getattr(function, "__qualname__", type(function).__name__))
-    return name if module in ("__main__", "builtins", "") else f"{module}.{name}"
+    return re.sub(r"<locals>\.|[<>]", "", getattr(function, "__qualname__", type(function).__name__))
 
 
 class _Examination:

@@ -372,7 +372,7 @@ def mysim(tmp_path):
         (["{}:nothing"], "the cost returned None"),
         (["{}:cost", "sigma=0"], "numbers above 0"),
         (["{}:cost", "theta=1"], "index 1 is out of bounds"),
-        (["{0}:leaves", "save={0}/folder"], "cannot be written"),
+        (["{0}:cost", "calls=20", "save={0}/folder"], "cannot be"),
     ],
 )
 def test_command_says_what_is_wrong_with_its_words(mysim, capsys, words, said):
