@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -11,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from bench.errors import StorageError, UserError, local_path, needing_sweeps, unknown
+from bench.errors import UserError, local_path, unknown
 from bench.examine import UPDATE
 from bench.examine.examination import examine
 from bench.examine.report import Report
-from bench.run.files import make_directory
 from bench.simulator import imports
 from bench.simulator.simulator import LIBRARIES
 
@@ -67,12 +65,6 @@ def _examined(cost: str, settings: Mapping[str, str], progress: bool) -> Report:
         raise UserError("theta is missing: give theta=1,0 or define theta in the file")
     given = {key: value for key, value in {"theta": "theta", **settings}.items() if key not in FILES}
     values = {key: _value(key, value, module) for key, value in given.items()}
-    if "save" in settings:  # what cannot be written is an error before the examination, not after it
-        with needing_sweeps("save"):
-            from bench.examine import files  # noqa: F401
-        make_directory(folder := local_path("save", settings["save"]))
-        if not os.access(folder, os.W_OK):
-            raise StorageError(f"save={folder} cannot be written: it is read-only")
     report = examine(function, name=cost, progress=progress, **values)
     words = " ".join(f"{key}={value}" for key, value in settings.items() if key != "expect")
     return replace(report, command=f"python -m bench examine {cost} {words}".strip())

@@ -218,8 +218,7 @@ def step_of_difference(stages: GradientStages, outcome: Check) -> str:
             continue
         steps = units[:, None] * DIFFERENCE_STEPS
         moved = np.zeros((stages.theta.size, 2, *steps.shape))
-        for row, (component, step) in enumerate(zip(index, steps, strict=True)):
-            moved[component, :, row] = np.stack([-step, step])
+        moved[index, :, np.arange(len(index))] = np.stack([-steps, steps], axis=1)
         thetas = stages.theta[:, None] + moved.reshape(stages.theta.size, -1)
         minus, plus = stages.costs(thetas).reshape(2, *steps.shape)
         for name, slopes in (("forward", (plus - stages.value) / steps), ("central", (plus - minus) / (2 * steps))):
@@ -245,15 +244,12 @@ def relative_error(outcome: Check) -> float:
     A discretisation changes all components by an amount of one size, which is large beside a small component.
     """
     parts = [part for part in outcome.parts if np.isfinite([part.program, part.difference]).all()]
-    single = [part for part in parts if part.component is not None]
-    scale = np.array([part.sample.scale for part in single])
-    differences = np.array([part.difference for part in single]) * scale
-    apart = np.array([part.program for part in single]) * scale - differences
-    size = float(np.linalg.norm(differences))
-    errors = [(float(np.linalg.norm(apart)), size)]
+    single = [(p.program, p.difference, p.sample.scale) for p in parts if p.component is not None]
+    program, differences, scale = np.array(single).reshape(-1, 3).T
+    size = float(np.linalg.norm(differences * scale))
+    errors = [(float(np.linalg.norm(program * scale - differences * scale)), size)]
     # a group or a direction has length 1 in these units
-    whole = [part for part in parts if part.component is None]
-    errors += [(abs(part.program - part.difference), max(abs(part.difference), size)) for part in whole]
+    errors += [(abs(p.program - p.difference), max(abs(p.difference), size)) for p in parts if p.component is None]
     return max(error / size if size > 0 else float("inf") for error, size in errors)
 
 

@@ -27,8 +27,6 @@ from bench.simulator.clock import Clock, OutOfTime, parse_duration
 from bench.simulator.simulator import Simulator
 from bench.simulator.tree import ParameterTree
 
-GENERATED_SUFFIX = re.compile(r"_[0-9a-f]{8}$")
-"""Suffix of the generated name of a module that is loaded from a file."""
 TOLERANCE = 1e-4
 """Default relative error of a derivative below which it only causes a warning."""
 COMPILE_S = 300.0
@@ -137,7 +135,6 @@ def examine(
         "takes_steps": all(_takes_steps(function) for function in (cost, grad) if callable(function)),
     }
     cost, grad, refined = map(_with_own_warnings, (cost, grad, refined))
-    clock.start_stage("first call")
     # a cost of huge or infinite numbers overflows in the differences too, where a warning would tell nothing
     with np.errstate(all="ignore"):
         try:
@@ -199,12 +196,10 @@ def _takes_steps(function: Callable[..., Any]) -> bool:
 
 
 def _function_name(function: Any) -> str:
-    """Return the name of a function, such as ``mysim.cost``, or of the library that differentiates."""
+    """Return the name of a function, without brackets, or of the library that differentiates."""
     if function is None or isinstance(function, str):
         return function or ""
-    module = GENERATED_SUFFIX.sub("", getattr(function, "__module__", "") or "")
-    name = re.sub(r"<locals>\.|[<>]", "", getattr(function, "__qualname__", type(function).__name__))
-    return name if module in ("__main__", "builtins", "") else f"{module}.{name}"
+    return re.sub(r"<locals>\.|[<>]", "", getattr(function, "__qualname__", type(function).__name__))
 
 
 class _Examination:
@@ -288,14 +283,11 @@ class _Examination:
             sizes[group.name] = GroupSize(slope.size, allowed, whole)
         return sizes
 
-    def _attempt(self, what: str, function: Callable[[], Any]) -> Any:
-        """Return a function's result, or None where the budget ends."""
-        self.clock.start_stage(what)
-        try:
+    def _attempt(self, what: str, function: Callable[[], Any], share: float = 1.0) -> Any:
+        """Return a function's result within a share of the remaining budget, or None where that ends."""
+        with self.clock.stage(what, self.left_out, share):
             return function()
-        except OutOfTime:
-            self.left_out.append(what)
-            return None
+        return None
 
     def _explain(self, name: str, what: str, function: Callable[..., Any], *given: Any) -> None:
         """Set a comparison of :attr:`explained`, unless the budget ends before."""
@@ -324,9 +316,7 @@ class _Examination:
         """Compare the mean over draws of a gradient that is not the derivative at one of them."""
         is_of_a_draw = any(one.cause in OF_A_DRAW for one in (checked, *self.stages.more))
         if self.means is None and self.simulator.noise and is_of_a_draw and self.stages.gradient is not None:
-            self.clock.limit(MEANS_SHARE)
-            self.means = self._attempt("the mean over draws", lambda: compare_means(self.stages))
-            self.clock.limit(1.0)
+            self.means = self._attempt("the mean over draws", lambda: compare_means(self.stages), MEANS_SHARE)
 
     def _find_smooth_parts(self, checked: Check) -> None:
         if self.stages.gradient is not None and not self.explained.smooth_parts and diagnosis.doubtful(checked):
@@ -371,22 +361,17 @@ class _Examination:
 
         They take at most ``share`` of the remaining budget.
         """
-        self.clock.start_stage("scanning lines")
         along, unit, lines = directions(2, spread, self.setup.seed), self.simulator.unit, list[LineScan]()
         effort = self._effort(self.clock.affordable(share) / len(along))
         sizes = [checked.noise, self.stages.repeats.spread, unit * abs(self.stages.value)]
         rounding = float(np.nan_to_num(sizes, posinf=0.0).max())
-        self.clock.limit(min(1.0, 2 * share))
-        try:
-            for direction in along if effort[0] else ():
+        with self.clock.stage("jumps and kinks on lines", self.left_out, min(1.0, 2 * share)):
+            if not effort[0]:
+                raise OutOfTime
+            for direction in along:
                 cost = partial(self.stages.costs_along, direction)
                 lines.append(self._integrated(scan(cost, direction, rounding, REACH, effort, unit), checked))
-        except OutOfTime:
-            pass
-        self.clock.limit(1.0)
-        if len(lines) < len(along):
-            self.left_out.append("jumps and kinks on lines")
-        elif effort[0] < POINTS:
+        if 0 < effort[0] < POINTS:
             self.left_out.append(
                 f"fine line scans: {effort[0]} points instead of {POINTS}, {effort[2]} places searched"
             )
@@ -435,14 +420,11 @@ class _Examination:
         results = []
         pairs = min(OWN_PAIRS if self.simulator.noise else PAIRS, max(FEWEST, HELD // size))
         for index, (level, spread) in enumerate(levels):
-            self.clock.start_stage(what := f"noise of sigma {level:g}")
-            self.clock.limit(1.0 / (len(levels) - index))
             unseen = partial(largest_unseen, lines, level / self.setup.reach) if self.setup.levels else None
-            one = measure_smoothed(self.simulator, level, spread, plain, self.setup.seed, pairs, unseen)
-            self.clock.limit(1.0)
-            results += [one] if one else []
-            self.left_out += [] if one else [what]
-        return results
+            given = (self.simulator, level, spread, plain, self.setup.seed, pairs, unseen)
+            measure = partial(measure_smoothed, *given)
+            results.append(self._attempt(f"noise of sigma {level:g}", measure, 1.0 / (len(levels) - index)))
+        return [one for one in results if one]
 
     def _own_level(self) -> list[tuple[float, np.ndarray]]:
         """Return a sigma under which theta moves the cost by a share of what its own noise does."""

@@ -385,7 +385,8 @@ class Findings:
             yield "staircase", failed in SUSPICIOUS and (self._is_residue or self.has_steps), numbers
             yield "adaptive", failed == "unsettled" and bool(explained.smooth_parts), numbers
             is_gap = failed in EXCUSABLE and not explained.refined and self.is_discretisation_gap
-            yield "adaptive", is_gap, f"{numbers}, a loop of changing length at {explained.steps or 'no known place'}"
+            loop = f", the loop at {explained.steps} has another length at other thetas" * bool(explained.steps)
+            yield "adaptive", is_gap, f"{numbers}{loop}"
             yield "overwritten", is_grown and failed in (*UNEQUAL, "unsettled"), numbers
             is_falling = self.hint is not None and self.hint.cause == "continuous_adjoint"
             yield "continuous_adjoint", is_falling and failed in SUSPICIOUS, numbers
@@ -647,10 +648,15 @@ class Findings:
         return 2.0**-7 if self.precision == "bfloat16" else float(np.finfo(self.precision).eps)
 
     @property
+    def resolved_parts(self) -> list[Part]:
+        """The components whose differences have at least one correct digit."""
+        return [p for p in self.named.components if p.uncertainty < DIGIT * abs(p.difference)]
+
+    @property
     def resolution(self) -> float:
-        """The smallest relative error that the differences detect."""
-        parts = [p for p in self.named.components if p.uncertainty < DIGIT * abs(p.difference)]
-        return max([resolution(self.unit), *(CHANCE * p.uncertainty / abs(p.difference) for p in parts)])
+        """The smallest relative error that these differences detect."""
+        errors = [CHANCE * p.uncertainty / abs(p.difference) for p in self.resolved_parts]
+        return max([resolution(self.unit), *errors])
 
     def recommended(self, one: Smoothed) -> Method | None:
         """Return the fastest usable method at a sigma; None if none is known."""
@@ -698,7 +704,7 @@ class Findings:
     def line_rows(self) -> list[dict[str, Any]]:
         """Return a row per line through theta: its jumps and kinks, and the share of the change that the gradient misses."""
         return [
-            {"line": index + 1, "jumps": len(line.jumps), "kinks": len(line.kinks), "share missed by the gradient": line.missed if math.isfinite(line.missed) else "unknown",
+            {"line": index + 1, "jumps": len(line.jumps), "kinks": len(line.breaks) - len(line.jumps), "share missed by the gradient": line.missed if math.isfinite(line.missed) else "unknown",
              "staircase": line.steps, "not finite": int((~np.isfinite(line.costs)).sum())}
             for index, line in enumerate(self.lines)
         ]  # fmt: skip

@@ -75,11 +75,6 @@ class LineScan:
         return tuple(b for b in self.breaks if b.kind == "jump")
 
     @property
-    def kinks(self) -> tuple[Break, ...]:
-        """The kinks."""
-        return tuple(b for b in self.breaks if b.kind == "kink")
-
-    @property
     def tread(self) -> float:
         """The common height of all jumps, if there are at least four, of equal height and evenly spaced; else 0.
 

@@ -70,8 +70,8 @@ class Mean:
         return "estimator" if self.error + self.doubt <= RIGHT else "spread"
 
 
-def compare_means(stages: GradientStages) -> Mean | None:
-    """Return the comparison with as many draws as decide it and the clock's limit allows; None with less than a round."""
+def compare_means(stages: GradientStages) -> Mean:
+    """Return the comparison with as many draws as decide it and the clock's limit allows; raises :class:`OutOfTime` with less than a round."""
     size, random = stages.theta.size, np.random.default_rng([stages.seed, 0x6D65616E])
     vectors = np.eye(size) if size <= ALONG else random.standard_normal((size, ALONG))
     vectors = stages.scale[:, None] * vectors / np.linalg.norm(vectors, axis=0)
@@ -86,7 +86,8 @@ def compare_means(stages: GradientStages) -> Mean | None:
                 break
             count = result.draws
     except OutOfTime:
-        pass
+        if result is None:
+            raise
     return result
 
 

@@ -72,16 +72,16 @@ class Smoothed:
     norm: float
     """|grad J|, with the contribution of noise subtracted."""
     pairs: int
-    bias: float
+    bias: float = math.nan
     """|E program's gradient - grad J|, with the contribution of noise subtracted; NaN without a gradient."""
-    bias_low: float
-    bias_high: float
+    bias_low: float = math.nan
+    bias_high: float = math.nan
     """The 95% interval of the bias."""
-    moved: float
+    moved: float = math.nan
     """|grad J - grad cost| at theta, the effect of smoothing; NaN without a right gradient."""
-    remark: str
+    remark: str = ""
     """Why the intervals may be too narrow; empty if there is no such reason."""
-    methods: tuple[Method, ...]
+    methods: tuple[Method, ...] = ()
     n_moved: int = 0
     """Number of pairs whose costs differ."""
     n_lost: int = 0
@@ -143,10 +143,10 @@ def measure_smoothed(
     seed: int = 0,
     pairs: int = PAIRS,
     unseen: Callable[[int], tuple[float, float]] | None = None,
-) -> Smoothed | None:
+) -> Smoothed:
     """Return the gradient's bias and the methods' costs under noise ``spread * u`` on theta, called ``sigma``.
 
-    None where the time is too short for :data:`FEWEST` pairs. ``plain (d,)`` is the gradient at theta without noise, if
+    Raises :class:`OutOfTime` where the time is too short for :data:`FEWEST` pairs. ``plain (d,)`` is the gradient at theta without noise, if
     it is known to be right. At most ``pairs`` pairs are drawn. ``unseen`` is the part of ``sigma * grad J`` that a number of
     draws may miss.
     """
@@ -161,7 +161,9 @@ def measure_smoothed(
                 break
             size *= 2
     except OutOfTime:
-        pass
+        if result is None:
+            raise
+    assert result is not None
     return result
 
 
@@ -192,18 +194,17 @@ def _summary(
     # an input without noise has no smoothed derivative
     noisy = spread > 0
     spread, dim = spread[noisy], int(noisy.sum())
-    u, d = drawn[:size][noisy], drawn[size]
-    up, down = drawn[size + 1 : 2 * size + 1][noisy], drawn[2 * size + 1 :][noisy]
+    d = drawn[size]
+    u, up, down = (drawn[first : first + size][noisy] for first in (0, size + 1, 2 * size + 1))
     plain = None if plain is None else plain[noisy]
     if not np.isfinite(d).all():
         share = f"{int((~np.isfinite(d)).sum())} of {pairs} pairs have a cost that is not a number"
-        nothing = np.full(dim, np.nan)
-        return Smoothed(sigma, nothing, math.inf, math.nan, pairs, math.nan, math.nan, math.nan, math.nan, share, ())
+        return Smoothed(sigma, np.full(dim, np.nan), math.inf, math.nan, pairs, remark=share)
     # in units of the largest sigma: an input's share of the bias is by how much it moves the cost under its own noise
     weight = (spread / spread.max())[:, None]
     up, down = weight * up, weight * down
-    terms = weight * d * u / spread[:, None]
-    groups = _means(weight * _terms(u, d) / spread[:, None])
+    terms = d * u / spread.max()
+    groups = _means(_terms(u, d) / spread.max())
     truth = groups.mean(axis=0)
     error = float(np.sqrt(groups.var(axis=0, ddof=1).sum() / GROUPS))
     norm = math.sqrt(max(float(truth @ truth) - error**2, 0.0))

@@ -169,21 +169,16 @@ class GradientStages:
 
     def run(self, explain: Callable[[Check], None]) -> None:
         """Run all stages that the budget allows; ``explain`` gets the outcome of a wrong gradient before it is named."""
-        try:
+        with self.clock.stage("the gradient check", self.left_out):
             self._start()
-        except OutOfTime:
-            if math.isnan(self.value):
-                self.left_out.append("the cost at theta")
-            self.left_out.append("the gradient check")
+        if self.left_out:
             return
-        try:
+        with self.clock.stage("calls that raised an exception, once more", self.left_out):
             self._repeat_failures()
             if self.is_failed:
                 return
             self._run_stages(explain)
             self._repeat_failures()
-        except OutOfTime:
-            self.left_out.append("calls that raised an exception, once more")
 
     def _repeat_failures(self) -> None:
         """Repeat calls that raised an exception, which may do so at random."""
@@ -197,16 +192,13 @@ class GradientStages:
     def _run_stages(self, explain: Callable[[Check], None]) -> None:
         space = choose(self.layout, self.scale, self.gradient, self.seed)
         self.groups = space.groups
-        try:
+        with self.clock.stage("the check at more than one step", self.left_out):
             for stage in (partial(self._compare_quickly, space), self._repeat):
                 stage()
                 if self._has_hidden_single():
                     self.simulator.precision = "float32"
                     self._compare_quickly(space)
-        except OutOfTime:
-            self.left_out.append("the check at more than one step")
-            return
-        if not self.check.parts:
+        if "the check at more than one step" in self.left_out or not self.check.parts:
             return
         self._check_in_stages(space, explain)
         self._locate(space)
@@ -214,15 +206,13 @@ class GradientStages:
 
     def _start(self) -> None:
         """Compute the cost at theta, once more, and the gradient."""
-        simulator, clock = self.simulator, self.clock
-        clock.start_stage("the cost at theta")
+        simulator = self.simulator
         self.value = simulator.first_value
         if simulator.noise or simulator.batch != "loop" or math.isnan(self.value):
             self.value = float(self.costs(self.theta[:, None])[0])
         self.repeats.floor = simulator.unit**SMALL * (abs(self.value) if math.isfinite(self.value) else 0.0)
         if not simulator.has_gradient:
             return
-        clock.start_stage("first gradient")
         gradient = self.gradient_at(self.theta)
         self.is_failed = simulator.n_failed_gradients > 0
         if not self.is_failed:
@@ -230,7 +220,6 @@ class GradientStages:
 
     def _compare_quickly(self, space: Subspace) -> None:
         """Compare the gradient with two costs per coordinate, and with more where the full steps do not fit."""
-        self.clock.start_stage("one step per component")
         cost, unit = partial(self._costs_in, space, None), self.simulator.unit
         quick = FewSteps(space, cost, self.gradient, self.value, unit, self.repeats.spread)
         try:
@@ -246,14 +235,11 @@ class GradientStages:
 
     def _repeat(self) -> None:
         """Repeat calls, after equal and after other thetas, and compare the results."""
-        self.clock.start_stage("repeating a call")
         other, values = self.theta + 1e-3 * self.scale, [self.value]
         is_other = (False, False, True, False, False, True, False, False)  # the first call was made before
-        try:
+        with self.clock.stage("repeating a call", self.left_out):
             for each in is_other[1:]:
                 values.append(float(self.costs((other if each else self.theta)[:, None])[0]))
-        except OutOfTime:
-            self.left_out.append("repeating a call")
         self._repeat_gradient(other)
         for each in (False, True):
             same = [value for value, one in zip(values, is_other, strict=False) if one == each]
@@ -271,15 +257,11 @@ class GradientStages:
         """Compare the gradient with that of an equal call after one at ``other (d,)``."""
         if self.gradient is None or not np.isfinite(self.gradient).all():
             return
-        try:
+        with self.clock.stage("repeating a gradient", self.left_out):
             self.gradient_at(other)
-            again = self.gradient_at(self.theta)
-        except OutOfTime:
-            self.left_out.append("repeating a gradient")
-            return
-        size = float(np.linalg.norm(self.gradient))
-        if size and np.isfinite(again).all():
-            self.repeats.of_gradient = float(np.linalg.norm(again - self.gradient)) / size
+            again, size = self.gradient_at(self.theta), float(np.linalg.norm(self.gradient))
+            if size and np.isfinite(again).all():
+                self.repeats.of_gradient = float(np.linalg.norm(again - self.gradient)) / size
 
     def _has_hidden_single(self) -> bool:
         """Return whether a cost that returns float64 computes in float32: its values have single precision, or it reads
@@ -294,7 +276,6 @@ class GradientStages:
             return True
         if not self._repeated:
             return False
-        self.clock.start_stage("precision")
         with np.errstate(all="ignore"):
             rounded = self.theta.astype(np.float32)
             first, ulp = rounded.astype(np.float64), np.spacing(np.abs(rounded)).astype(np.float64)
@@ -336,7 +317,6 @@ class GradientStages:
         return costs, gradients
 
     def _check_in_stages(self, space: Subspace, explain: Callable[[Check], None]) -> None:
-        self.clock.start_stage("checking the gradient")
         if not self._run_stage("more steps", space, self._options(space.size), SHARE):
             return
         draws = [MOST, FEW, 0] if self.theta.size <= MANY else [FEW, 0]
@@ -355,17 +335,12 @@ class GradientStages:
 
     def _run_stage(self, name: str, space: Subspace, options: Options, share: float) -> bool:
         """Run a stage if it fits a share of the remaining budget, and return whether it has finished."""
-        try:
+        with self.clock.stage(name, self.left_out, MOST_OF_IT):
             if not self.clock.can_afford(*self._cost_of(options, space.size), share=share):
                 raise OutOfTime
-            self.clock.limit(MOST_OF_IT)
             self.check, self.is_quick = space.restore(self._check_once(space, options)), False
-        except OutOfTime:
-            self.left_out.append(name)
-            return False
-        finally:
-            self.clock.limit(1.0)
-        return True
+            return True
+        return False
 
     def _check_once(self, space: Subspace, options: Options, w: np.ndarray | None = None) -> Check:
         outcome = check(
@@ -390,17 +365,14 @@ class GradientStages:
         """Find the numbers that cause the error of each wrong group."""
         if self.gradient is None:
             return
-        self.clock.start_stage("locating the error")
         groups = {group.name: group for group in space.groups}
-        try:
+        with self.clock.stage("the place of the error in its group", self.left_out):
             for part in self.check.parts:
                 if part.name in groups and part.verdict in FAULTS and math.isfinite(part.program):
                     first, last = locate(groups[part.name], self.theta, self.gradient, self.costs, part)
                     self.located[part.name] = self.layout.block(first, last)
                     if last - first == 1 and first not in space.components:
                         self._check_number(first, part.verdict)
-        except OutOfTime:
-            self.left_out.append("the place of the error in its group")
 
     def _check_number(self, index: int, verdict: str) -> None:
         """Check a single number of theta, and add it to the check with a verdict if it is wrong.
@@ -424,14 +396,12 @@ class GradientStages:
             return
         space = choose(self.layout, self.scale, self.gradient, self.seed)
         options = replace(self._options(space.size, 0), components=0, scanned=0, repeated=False)
-        try:
+        with self.clock.stage("checks under other noise", self.left_out):
             if not self.clock.can_afford(*self._cost_of(options, 0), share=SHARE):
                 raise OutOfTime
             for _ in range(OTHER_NOISE):
                 w = self._random.standard_normal((self.simulator.noise, 1))
                 self.more.append(space.restore(self._check_once(space, options, w)))
-        except OutOfTime:
-            self.left_out.append("checks under other noise")
 
 
 def _are_equal(values: np.ndarray) -> bool:

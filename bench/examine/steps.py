@@ -47,30 +47,21 @@ def traced_loops(simulator: Simulator, theta: np.ndarray, w: np.ndarray | None) 
     loops: Loops = {}
 
     def enter(frame: FrameType, event: str, argument: Any) -> Any:
-        code = frame.f_code
-        if event != "call" or any(folder in code.co_filename for folder in SKIPPED):
-            return None
-        own, last, running = _while_loops(code.co_filename), frame.f_lineno, dict[int, int]()
-        if not own:
-            return None
-
-        def finish(line: int) -> None:
-            loops.setdefault((code.co_filename, line), set()).add(running.pop(line))
+        file, last, running = frame.f_code.co_filename, frame.f_lineno, dict[int, int]()
+        own = {} if event != "call" or any(folder in file for folder in SKIPPED) else _while_loops(file)
 
         def follow(frame: FrameType, event: str, argument: Any) -> Any:
             nonlocal last
-            line = frame.f_lineno
-            if event == "line" and line in own:
-                if line in running and not line <= last <= own[line]:
-                    finish(line)
+            line, is_round = frame.f_lineno, event == "line" and frame.f_lineno in own
+            is_new = is_round and not line <= last <= own[line]
+            for each in [one for one in running if event == "return" or (is_new and one == line)]:
+                loops.setdefault((file, each), set()).add(running.pop(each))
+            if is_round:
                 running[line] = running.get(line, 0) + 1
-            if event == "return":
-                for line in list(running):
-                    finish(line)
-            last = frame.f_lineno
+            last = line
             return follow
 
-        return follow
+        return follow if own else None
 
     simulator.trace(enter, *(part for part in (theta[:, None], w) if part is not None))
     return loops

@@ -44,7 +44,7 @@ def conclusion(report: Findings) -> str:
         return f"Derivative: {report.derivative.upper()}. {problems(report)[0]}"
     fact = report.n_checked + ", at this theta only" * (not report.check.draws)
     if report.derivative == RIGHT:
-        fact += f", errors above {number(100 * report.resolution, 1)}% are seen"
+        fact += f", {len(report.resolved_parts)} of them to {number(100 * report.resolution, 1)}%"
     small = [part for part in report.small_errors if part.component is not None] or report.small_errors
     off = f" within the tolerance, off by up to {number(100 * small[0].distance)}%" if small else ""
     fact = report.mean_text if report.derivative_cause == "estimator" else fact
@@ -164,13 +164,9 @@ def write(report: Findings) -> str:
 
 
 def _checked(report: Findings) -> str:
-    whole = [part for part in report.check.parts if part.component is None]
-    counts = {
-        "step size": max((part.sample.step.size for part in report.check.parts), default=0),
-        "direction": len(whole), "check": len(report.check.draws), "line": len(report.lines),
-    }  # fmt: skip
-    known = [counted(count, what) + " at other thetas" * (what == "check") for what, count in counts.items() if count]
-    return ", ".join([report.n_checked, *known, *(f"sigma {report.setup.shown(one.sigma)}" for one in report.smoothed)])
+    sigmas = [f"sigma {report.setup.shown(one.sigma)}" for one in report.smoothed]
+    others = counted(len(report.check.draws), "direction") + " at other thetas"
+    return ", ".join([report.n_checked, others, counted(len(report.lines), "line"), *sigmas])
 
 
 def _unchecked(report: Findings) -> list[str]:

@@ -200,20 +200,16 @@ class Watch:
         with needing_sweeps("a chart"):
             from matplotlib.figure import Figure
 
-        at = [row["iteration"] for row in self.rows]
+        columns = {name: [row[name] for row in self.rows] for name in COLUMNS}
         figure = Figure(figsize=(7.0, 6.0), layout="constrained")
-        panels = figure.subplots(3, sharex=True)
-        for panel, name, scale in zip(
-            panels, ("gradient_norm", "error", "cosine"), ("log", "log", "linear"), strict=True
-        ):
-            panel.plot(at, [row[name] for row in self.rows], "o-")
-            panel.set(ylabel=name.replace("_", " "), yscale=scale)
-        panels[2].fill_between(at, *([row[f"cosine_{end}"] for row in self.rows] for end in ("low", "high")), alpha=0.2)
-        panels[2].set(xlabel="iteration", ylim=(-1.05, 1.05))
-        if self.first is not None:
-            for panel in panels:
-                panel.axvline(self.first[0], color="tab:red")
-            panels[0].set_title(f"iteration {self.first[0]}: {self.first[1]}", color="tab:red", loc="left")
+        scales = {"gradient_norm": "log", "error": "log", "cosine": "linear"}
+        for panel, (name, scale) in zip(figure.subplots(3, sharex=True), scales.items(), strict=True):
+            panel.plot(columns["iteration"], columns[name], "o-")
+            panel.set(ylabel=name.replace("_", " "), yscale=scale, xlabel="iteration" * (name == "cosine"))
+            if self.first is not None:
+                panel.axvline(self.first[0], color="tab:red", label=self.first[1])
+                panel.legend()
+        panel.fill_between(columns["iteration"], columns["cosine_low"], columns["cosine_high"], alpha=0.2)
         figure.savefig(path, dpi=150)
         return Path(path)
 

@@ -174,10 +174,18 @@ class Clock:
         """Return the mean seconds per gradient, NaN before the first timed call."""
         return self.gradient_s / self._timed["gradients"] if self._timed["gradients"] else math.nan
 
-    def start_stage(self, name: str) -> None:
-        """Show the name of the next stage on the progress line."""
+    @contextmanager
+    def stage(self, name: str, left_out: list[str], share: float = 1.0) -> Iterator[None]:
+        """Run a stage within a share (0 to 1) of the remaining budget; where that ends before, its name is left out."""
         self._stage = name
         self._show_progress(force=True)
+        self.limit(share)
+        try:
+            yield
+        except OutOfTime:
+            left_out.append(name)
+        finally:
+            self.limit(1.0)
 
     def _show_progress(self, force: bool = False) -> None:
         if self._shown and (force or self.elapsed - self._last_shown > PROGRESS_INTERVAL_S):

@@ -55,23 +55,6 @@ def test_an_error_within_the_tolerance_is_in_the_headline():
     assert report.conclusion.startswith("Derivative: right within the tolerance, off by up to 4.0%.")
 
 
-def test_the_headline_has_the_numbers_of_its_own_cause():
-    def slope(x):
-        return np.array(
-            [
-                2 * np.cos(x[0]) + np.cos(x[1]) - 0.01 * x[0] ** 2,
-                2 * x[1] - x[0] * np.sin(x[1]) - 0.3 * np.cos(3 * x[0]),
-            ]
-        )
-
-    report = examine(
-        lambda x: float(2 * np.sin(x[0]) + np.cos(x[1]) * x[0] + x[1] ** 2), np.array([0.7, 0.1]), grad=slope
-    )
-    assert list(report.frame["verdict"][:2]) == ["missing_term", "wrong_adjoint"]
-    assert report.conclusion.startswith(f"Derivative: WRONG. {report.frame['verdict'][0]}:")
-    assert f"theta[0]: program {report.frame['program'][0]:.6g}" in report.conclusion
-
-
 def test_a_problem_is_said_of_the_sigmas_that_show_it():
     report = examine(lambda x: float(x @ x + (x[0] > 1.2)), np.ones(2), grad=lambda x: 2 * x, sigma=[0.01, 0.2])
     assert report.noise_answer.startswith("Under noise of sigma 0.20: NOT usable. biased")
@@ -83,19 +66,6 @@ def test_a_cost_without_a_gradient_gets_what_smoothing_gives_under_noise():
     (row,) = report.sigma_rows()
     assert row["norm"] == pytest.approx(5.5, abs=0.2)
     assert row["method"] == "smoothing"
-
-
-def test_a_few_calls_in_single_precision_reach_lines_and_noise():
-    def single(x):
-        x = np.asarray(x, np.float32)
-        return np.float32(np.sin(x[0]) * x[1] + np.float32(0.3) * x[2] ** 2)
-
-    def slope(x):
-        return np.array([np.cos(x[0]) * x[1], np.sin(x[0]), 0.6 * x[2]], np.float32)
-
-    report = examine(single, [0.4, 0.7, 1.2], grad=slope, sigma=0.05, calls=1500)
-    assert report.lines
-    assert report.use == "usable", str(report)
 
 
 @pytest.mark.parametrize("pairs", [128, 1024])

@@ -76,14 +76,6 @@ def test_settings_of_the_command_line(sim, capsys):
     assert run(f"{sim}:cost", "tolerance=1,2,3") == 2
 
 
-def test_a_folder_that_cannot_be_written_is_an_error_before_the_examination(sim, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("os.access", lambda path, mode: False)
-    assert run(f"{sim}:cost", "calls=300", f"save={tmp_path}") == 2
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert f"save={tmp_path} cannot be written" in printed.err
-
-
 # -------------------------------------------------------------------------------------------- baseline
 
 

@@ -120,7 +120,7 @@ def test_a_gradient_that_is_right_at_one_theta_is_said_to_be_right_there_only():
     few = examine(lambda x: float(np.sin(x).sum()), [0.3, 0.7], grad=stale, calls=30)
     assert "at this theta only" in few.conclusion
     assert "other thetas around this one (calls)" in str(few)
-    many = examine(lambda x: float(np.sin(x).sum()), [0.3, 0.7], grad=stale, calls=1000)
+    many = examine(lambda x: float(np.sin(x).sum()), [0.3, 0.7], grad=stale, calls=3000)
     assert many.cause == "stale_gradient"
 
 

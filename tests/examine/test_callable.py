@@ -29,19 +29,6 @@ def scene(**values):
     return registry.make("scenes", "callable", values)
 
 
-@pytest.mark.slow
-def test_a_file_is_a_problem(file):
-    problem = bench.problem(f"callable[cost={file}:cost,sigma=0.1]", backend="callable")
-    assert problem.program.theta0.tolist() == [2.0, 0.5]
-    w = np.array([[0.0, 2.0], [0.0, 0.0]])
-    np.testing.assert_allclose(problem.value(problem.program.theta0, w), [2.0, 2.2**2 * 0.5 + 1])
-    np.testing.assert_allclose(problem.grad(problem.program.theta0, w)[:, 0], [2.0, 4.0])
-    found = bench.estimate(
-        problem, "randomized_smoothing", samples=64, repeats=8, reference_samples=4096, tolerance=0.1
-    )
-    assert found.summary.reference_norm > 4.4  # sqrt(2^2 + 4^2), and the jump, which the gradient does not see
-
-
 def test_own_noise_comes_after_that_of_theta(file):
     values = dict(cost=f"{file}:noisy", grad="noisy_gradient", own_noise=1, sigma=0.1)
     problem = bench.plugin.compose(scene(**values))

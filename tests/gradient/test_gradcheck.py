@@ -177,20 +177,6 @@ def test_command_writes_files_and_exits_with_0(tmp_path, capsys):
     assert json.loads((directory / "run.json").read_text())["study"] == "gradient_check"
 
 
-@pytest.mark.slow
-def test_fault_is_exit_status_1_and_has_a_line_that_repeats_it(tmp_path, monkeypatch, capsys):
-    from bench.plugins.backends.numpy import NumpyProblem
-
-    right = NumpyProblem._grad
-    monkeypatch.setattr(NumpyProblem, "_grad", lambda self, theta, w: -right(self, theta, w))
-    words = ["gradcheck", "pushing[mass=0.2]", "contacts=[penalty]", "backends=[numpy]", "sweep.horizon=[2]"]
-    assert main([*words, "workers=0", f"results_dir={tmp_path}"]) == 1
-    printed = capsys.readouterr().out
-    assert "wrong_factor (start" in printed
-    assert "ratio -1" in printed
-    assert (tmp_path / "gradcheck" / "gradient_check.md").read_text().count("python -m bench gradcheck") == 1
-
-
 def test_contacts_of_an_engine_are_asked_from_the_engine(bounce, monkeypatch):
     """An engine's steps cannot be taken in NumPy, and some of its contacts are known to the engine only."""
     problem = compiled(bounce.program.scene, bounce.program.contact, "mujoco")
