@@ -207,7 +207,6 @@ class _Expansion:
 
     def __init__(self, experiment: Experiment) -> None:
         self._experiment = experiment
-        self._paths: dict[tuple[int, Decision], Cell] = {}
 
     def cell(self, point: Mapping[str, Any], choices: Mapping[str, Choice]) -> Cell:
         """Return the cell of these choices at a point of the sweep."""
@@ -234,18 +233,15 @@ class _Expansion:
 
     def _path(self, scene: Plugin | None, start: Decision) -> Cell:
         """Return the cell at the start of a descent; its contact law has the scene's own values, and none of the sweep's."""
-        key = (id(scene), start)
-        if key not in self._paths:
-            parts: dict[str, Plugin | None] = {"scene": scene}
-            for axis in DESCENDED:
-                choice = self._experiment.path.get(axis)
-                parts[axis] = None
-                if choice is not None and choice.entry.plugin is not None and _uses(scene, axis):
-                    own = getattr(scene, "contact_values", {}) if axis == "contact" else {}
-                    values = {k: v for k, v in own.items() if k in parameters(choice.entry.plugin)}
-                    parts[axis] = _build(choice.entry.plugin, sorted((values | dict(choice.values)).items()))
-            self._paths[key] = Cell(parts, samples=0, repeats=0, seed=0, study=self._experiment.study, decision=start)
-        return self._paths[key]
+        parts: dict[str, Plugin | None] = {"scene": scene}
+        for axis in DESCENDED:
+            choice = self._experiment.path.get(axis)
+            parts[axis] = None
+            if choice is not None and choice.entry.plugin is not None and _uses(scene, axis):
+                own = getattr(scene, "contact_values", {}) if axis == "contact" else {}
+                values = {k: v for k, v in own.items() if k in parameters(choice.entry.plugin)}
+                parts[axis] = _build(choice.entry.plugin, sorted((values | dict(choice.values)).items()))
+        return Cell(parts, samples=0, repeats=0, seed=0, study=self._experiment.study, decision=start)
 
     def _decision(self, point: Mapping[str, Any], parts: Mapping[str, Plugin | None]) -> Decision:
         """Return theta at a point of the sweep; coordinates that are not swept keep their values."""
