@@ -10,16 +10,12 @@ from classes import (
     Clipped,
     ControlVariate,
     FiniteDifference,
-    Fobg,
     Guided,
     Numpy,
-    Penalty,
     Plain,
     PlainDifference,
-    Pushing,
     RandomizedSmoothing,
     Reinforce,
-    SemiImplicitEuler,
     SoftHeaviside,
     SphereSmoothing,
     Torch,
@@ -28,8 +24,6 @@ from helpers import loaded
 
 import bench
 from bench.measure import noise
-from bench.measure.reference import certify
-from bench.measure.statistics import summarise
 from bench.model import compose
 from bench.run.session import Session
 
@@ -54,33 +48,6 @@ def test_confidence_radius_uses_the_failure_probability():
     assert below == pytest.approx(zeroth, rel=1e-12)
     assert above[0, 0] != below[0, 0]
     assert abs(above - below).max() <= 0.0011 * eps
-
-
-def weights(estimator, stiffness, samples=100, repeats=12):
-    program = compose(Pushing(horizon=10, sigma=0.1), Penalty(stiffness=stiffness), SemiImplicitEuler())
-    problem = Numpy().compile(program)
-    w = noise.draw(0, "pushing", repeats, samples, program.n_noise, "cells")
-    truth = certify(problem, Numpy().provides, 1 << 14, 0.005)
-    values, decided = estimator.estimate_with_diagnostics(problem, program.theta0, w)
-    return summarise(values, truth.known(), samples).rmse_rel, decided.get("alpha")
-
-
-@pytest.mark.parametrize("stiffness", [10.0, 1e3])
-def test_the_default_accuracy_leaves_alpha_order_its_first_order_share(stiffness):
-    error, alpha = weights(AlphaOrder(), stiffness)
-    assert (alpha > 0).all()
-    assert error < 0.5 * weights(Reinforce(), stiffness)[0]
-
-
-def test_sharing_takes_every_sample_for_both_orders():
-    problem = Torch().compile(compose(SoftHeaviside(nu=0.2)))
-    theta, w = problem.program.theta0, noise.draw(5, "shared", 3, 64, 1, "cells")
-    shared, decided = AlphaOrder().estimate_with_diagnostics(problem, theta, w)
-    alpha = decided["alpha"][:, None]
-    zeroth = Reinforce(baseline="center").estimate(problem, theta, w)
-    expected = alpha * Fobg().estimate(problem, theta, w) + (1 - alpha) * zeroth
-    np.testing.assert_allclose(shared, expected, rtol=1e-12)
-    assert (alpha > 0).all()
 
 
 ON_A_PLANE = [

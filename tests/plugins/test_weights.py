@@ -6,7 +6,6 @@ from bench.plugins.estimators.total_propagation import TotalPropagation, _weight
 from classes import (
     AlphaOrder,
     Cartpole,
-    Clipped,
     Cubic,
     InverseVariance,
     Numpy,
@@ -20,47 +19,26 @@ from bench.model import compose
 
 EXACT = 1e-12
 """The same few operations in another order."""
-REPEATS, SAMPLES = 3, 11
-
-
-@pytest.fixture(scope="module")
-def halves():
-    """Problem, noise, and by repeat the gradients of the first 5 samples and the zeroth-order terms of the other 6."""
-    problem = Numpy().compile(compose(Cubic(dimension=2, sigma=0.4)))
-    theta = problem.program.theta0
-    noise = np.random.default_rng(0).standard_normal((REPEATS, SAMPLES, 2))
-    centre = problem.value(theta, np.zeros((2, 1)))
-    first = [problem.grad(theta, w[:5].T) for w in noise]
-    zeroth = [(problem.value(theta, w[5:].T) - centre) * w[5:].T / 0.4 for w in noise]
-    return problem, theta, noise, first, zeroth
 
 
 def less_the_mean_of_the_others(costs):
     return np.array([cost - np.delete(costs, i).mean() for i, cost in enumerate(costs)])
 
 
-def test_inverse_variance_by_hand(halves):
-    problem, theta, noise, first, _ = halves
-    found = InverseVariance().estimate(problem, theta, noise)
-    zeroth = [less_the_mean_of_the_others(problem.value(theta, w[5:].T)) * w[5:].T / 0.4 for w in noise]
-    for r in range(REPEATS):
-        for i in range(2):
-            one, other = first[r][i], zeroth[r][i]
-            a, b = np.var(one, ddof=1) / 5, np.var(other, ddof=1) / 6
-            assert found[r, i] == pytest.approx((one.mean() / a + other.mean() / b) / (1 / a + 1 / b), rel=EXACT)
-
-
-def test_alpha_order_by_hand(halves):
-    """With a generous gamma the weight is that of the variances of both means, over all coordinates."""
-    problem, theta, noise, first, zeroth = halves
-    found = AlphaOrder(gamma=1e9, sharing="split").estimate(problem, theta, noise)
-    for r in range(REPEATS):
-        v1 = sum(np.var(first[r][i], ddof=1) / 5 for i in range(2))
-        v0 = sum(np.var(zeroth[r][i], ddof=1) / 6 for i in range(2))
-        alpha = v0 / (v1 + v0)
-        assert found[r] == pytest.approx(
-            alpha * first[r].mean(axis=1) + (1 - alpha) * zeroth[r].mean(axis=1), rel=EXACT
-        )
+def test_two_halves_are_weighted_by_hand():
+    """5 gradients and 6 zeroth-order terms: by each coordinate's variance, or, with a generous gamma, by their sum."""
+    problem = Numpy().compile(compose(Cubic(dimension=2, sigma=0.4)))
+    theta, noise = problem.program.theta0, np.random.default_rng(0).standard_normal((3, 11, 2))
+    centre = problem.value(theta, np.zeros((2, 1)))
+    methods = InverseVariance(), AlphaOrder(gamma=1e9, sharing="split")
+    each, whole = (method.estimate(problem, theta, noise) for method in methods)
+    for r, w in enumerate(noise):
+        first, costs, scores = problem.grad(theta, w[:5].T), problem.value(theta, w[5:].T), w[5:].T / 0.4
+        by_others, by_centre = less_the_mean_of_the_others(costs) * scores, (costs - centre) * scores
+        for found, zeroth, total in ((each[r], by_others, np.array), (whole[r], by_centre, np.sum)):
+            v1, v0 = (total(np.var(terms, axis=1, ddof=1) / terms.shape[1]) for terms in (first, zeroth))
+            expected = (v0 * first.mean(axis=1) + v1 * zeroth.mean(axis=1)) / (v0 + v1)
+            assert found == pytest.approx(expected, rel=EXACT)
 
 
 @pytest.mark.parametrize(
@@ -70,22 +48,6 @@ def test_alpha_order_by_hand(halves):
 )  # fmt: skip
 def test_rare_caps_of_alpha_order_are_a_remark(method, alpha, doubtful):
     assert bool(method.remark({"alpha": {"median": alpha}, "eps": {"median": 1.0}})) == doubtful
-
-
-@pytest.mark.parametrize("by", ["sample", "element"])
-def test_clipped_by_hand(halves, by):
-    """Of 11 gradients of two coordinates, each is cut to the batch's quantile: its norm, or each coordinate alone."""
-    problem, theta, noise, *_ = halves
-    found = Clipped(by=by, quantile=0.5).estimate(problem, theta, noise)
-    for r in range(REPEATS):
-        terms = problem.grad(theta, noise[r].T)
-        sizes = np.abs(terms) if by == "element" else np.sqrt(terms[0] ** 2 + terms[1] ** 2)[None]
-        limit = np.median(sizes, axis=1)
-        cut = [
-            [t * min(1.0, limit[i % len(sizes)] / s) for t, s in zip(terms[i], sizes[i % len(sizes)], strict=True)]
-            for i in range(2)
-        ]
-        assert found[r] == pytest.approx(np.mean(cut, axis=1), rel=EXACT)
 
 
 def test_the_default_sphere_smoothes_a_cubic_as_the_normal_does():
