@@ -249,13 +249,13 @@ def effort_share() -> str:
 
 
 FIGURES: dict[str, str | Callable[[], str]] = {
-    "fobg-stiff": 'stiffness_sweep/verdicts | method="fobg", problem="pushing, penalty, descent=0", at=10000 | error | interval',
+    "fobg-stiff": 'stiffness_sweep/verdicts | method="fobg (jax, torch)", problem="pushing, penalty, descent=0", at=10000 | error | interval',
     "plain-start": 'stiffness_sweep/verdicts | estimator="plain", problem="pushing, penalty, descent=0", at<=3000 | error_high | most',
     "plain-later": 'stiffness_sweep/verdicts | estimator="plain", problem="pushing, penalty, descent=0.9", at<=3000 | error_high | most',
     "plain-beyond": 'stiffness_sweep/verdicts | estimator="plain", problem="pushing, penalty, descent=0", at=10000 | error',
     "fobg-start": 'stiffness_sweep/verdicts | estimator="fobg", problem="pushing, penalty, descent=0", at<=3000 | error',
     "fobg-later": 'stiffness_sweep/verdicts | estimator="fobg", problem="pushing, penalty, descent=0.9", at<=3000 | error',
-    "fobg-beyond": 'stiffness_sweep/verdicts | method="fobg", problem="pushing, penalty, descent=0", at=10000 | error',
+    "fobg-beyond": 'stiffness_sweep/verdicts | method="fobg (jax, torch)", problem="pushing, penalty, descent=0", at=10000 | error',
     **{
         f"stability-{name.replace(' ', '-')}": stability(name)
         for name in ("cells", "wrong", "blows up", "grew", "by step", "by law", "by both", "by unknown")
