@@ -67,7 +67,7 @@ def derivatives_agree(policy: Policy) -> str:
     def cost(thetas: np.ndarray) -> np.ndarray:
         return np.array([(weights * policy.act(np, theta[:, None], observations)).sum() for theta in thetas.T])
 
-    exact = jax.grad(lambda theta: (weights * policy.act(jnp, theta[:, None], observations)).sum())
+    exact = jax.jit(jax.grad(lambda theta: (weights * policy.act(jnp, theta[:, None], observations)).sum()))
     found = check(cost, lambda theta: np.asarray(exact(theta)), theta[:, 0], Options(draws=0))
     require(found.trusted, found.sentence())
     share = np.mean(found.gradient != 0.0)  # a rectified unit may be always inactive

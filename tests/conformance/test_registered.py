@@ -32,6 +32,7 @@ from bench.model import (
     ImpulseLaw,
     MechanicalScene,
     Plugin,
+    SampleMean,
     Scene,
     compose,
     registry,
@@ -195,7 +196,13 @@ def is_run(plugin, check):
     return "physics" not in plugin.provides or bool(EVERYWHERE & set(changed(plugin)))
 
 
-@kit_items(is_run, lambda plugin, check: is_long(plugin, check) or is_varied(plugin))
+def is_slow(plugin, check):
+    """Whether a check is left to the slow tests: a mean of terms has no other variance than one over N."""
+    is_mean = check == "variance_falls_as_one_over_n" and isinstance(plugin, SampleMean)
+    return is_long(plugin, check) or is_varied(plugin) or is_mean
+
+
+@kit_items(is_run, is_slow)
 def test_registered_plugin_conforms(plugin, check, on_few_programs):
     on_few_programs(plugin, check)
 

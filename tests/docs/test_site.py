@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import subprocess
+from unittest import mock
 
 import pytest
 
@@ -76,6 +77,7 @@ def test_an_experiment_without_results_has_its_question(tmp_path):
     assert not found.has_results
 
 
+@pytest.mark.slow
 def test_answers_are_carried_by_the_stored_tables():
     """Conditions in an answer hold, and the stored text is that of today's tables; an answer has two sentences at most."""
     for name, experiment in results.loaded(results.STANDARD).items():
@@ -93,9 +95,10 @@ def test_answers_are_carried_by_the_stored_tables():
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory):
+def site(pages, tmp_path_factory):
     """The folder of the built site."""
-    return website.build(tmp_path_factory.mktemp("site")).parent
+    with mock.patch.object(website, "sources", return_value=pages):
+        return website.build(tmp_path_factory.mktemp("site")).parent
 
 
 def dom(page, query=""):
