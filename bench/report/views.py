@@ -195,11 +195,12 @@ def shown_rmse(row: Any) -> tuple[Any, Any, Any, Any]:
     """Return the relative RMSE of one row or each row of a table, its interval, and whether the value is an upper limit.
 
     The value is the upper end of the interval where the bias is not distinguishable from 0 and the reference's error is at
-    least the standard deviation of one estimate, so that the reference's error decides the bias; NaN if that end is infinite.
+    least the standard deviation of one estimate, so that the reference's error decides the bias; NaN if that end is above 1,
+    the error of the zero estimate, since it then says nothing.
     """
     low, high = rmse_interval(row)
     is_limit = np.logical_not(row["bias_low"] > 0) & (row["reference_se"] >= np.sqrt(row["variance"]))
-    value = np.where(is_limit, np.where(np.isfinite(high), high, math.nan), row["rmse_rel"])
+    value = np.where(is_limit, np.where(high <= 1.0, high, math.nan), row["rmse_rel"])
     return np.where(np.isnan(row["rmse_rel"]), math.nan, value), low, high, is_limit
 
 
