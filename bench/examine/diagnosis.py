@@ -86,7 +86,7 @@ class Explanation:
     is_adaptive: bool | None = None
     """Whether steps that depend on theta explain the error, by the jumps of the cost; None: not compared."""
     steps: str | None = None
-    """The place of a loop whose length depends on theta, as ``ode.py:17``; empty without one, None: not searched."""
+    """A loop whose length depends on theta, as ``the loop at ode.py:17``; empty without one, None: not searched."""
     gaps: Sequence[Gap] = ()
     """At theta and at others: how far gradient and cost are from the refined cost; empty without a refined cost."""
     growth: Sequence[Horizon] = ()
@@ -119,7 +119,7 @@ def refined_gaps(stages: GradientStages, other: Simulator) -> list[Gap]:
 
 
 def changing_steps(stages: GradientStages) -> str:
-    """Return the place of a loop of the cost whose length depends on theta, as ``ode.py:17``; empty where none is known."""
+    """Return a loop of the cost whose length depends on theta, as ``the loop at ode.py:17``; empty where none is known."""
     random = np.random.default_rng([stages.seed, 0x6C6F6F70])
     moved = np.outer(stages.scale, SPREADS) * random.standard_normal((stages.theta.size, len(SPREADS)))
     return changing_loop(stages.simulator, stages.theta[:, None] + moved, stages.w)

@@ -385,7 +385,7 @@ class Findings:
             yield "staircase", failed in SUSPICIOUS and (self._is_residue or self.has_steps), numbers
             yield "adaptive", failed == "unsettled" and bool(explained.smooth_parts), numbers
             is_gap = failed in EXCUSABLE and not explained.refined and self.is_discretisation_gap
-            loop = f", the loop at {explained.steps} has another length at other thetas" * bool(explained.steps)
+            loop = f", {explained.steps} has another length at other thetas" * bool(explained.steps)
             yield "adaptive", is_gap, f"{numbers}{loop}"
             yield "overwritten", is_grown and failed in (*UNEQUAL, "unsettled"), numbers
             is_falling = self.hint is not None and self.hint.cause == "continuous_adjoint"

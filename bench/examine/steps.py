@@ -27,7 +27,7 @@ SKIPPED = tuple(
 
 
 def changing_loop(simulator: Simulator, thetas: np.ndarray, w: np.ndarray | None) -> str:
-    """Return the place of a while loop whose length depends on theta, as ``ode.py:17``; empty where none is known.
+    """Return a while loop whose length depends on theta, as ``the loop at ode.py:17``; empty where none is known.
 
     A JAX program is read: a loop whose condition depends on theta. Other Python code runs under a trace at
     ``thetas (d, n)``. Loops of compiled code are not seen.
@@ -38,7 +38,7 @@ def changing_loop(simulator: Simulator, thetas: np.ndarray, w: np.ndarray | None
     runs = [traced_loops(simulator, theta, w) for theta in thetas.T]
     for file, line in sorted(set.intersection(*map(set, runs))):
         if any(loops[file, line] != runs[0][file, line] for loops in runs):
-            return f"{Path(file).name}:{line}"
+            return f"the loop at {Path(file).name}:{line}"
     return ""
 
 
@@ -86,7 +86,7 @@ def _while_loops(file: str) -> dict[int, int]:
 
 
 def _loop_of_jax(simulator: Simulator, theta: np.ndarray, w: np.ndarray | None) -> str:
-    """Return the place of a while loop of a JAX program whose condition depends on theta; empty without one."""
+    """Return ``a while loop`` for a JAX program with a while loop whose condition depends on theta; empty without one."""
     if "jax" not in sys.modules:
         return ""
     import jax
@@ -118,7 +118,7 @@ def _depends(jaxpr: Any, given: list[bool], places: list[str]) -> list[bool]:
                 after = _depends(equation.params["body_jaxpr"].jaxpr, inputs[first : first + second] + carried, [])
                 carried = [a or b for a, b in zip(carried, after, strict=True)]
             if any(_depends(equation.params["cond_jaxpr"].jaxpr, inputs[:first] + carried, [])):
-                places.append(_place(equation))
+                places.append("a while loop")
             _depends(equation.params["body_jaxpr"].jaxpr, inputs[first : first + second] + carried, places)
             outputs = carried
         elif any(inputs):
@@ -141,13 +141,3 @@ def _programs(equation: Any) -> list[Any]:
             one = getattr(one, "jaxpr", one)
             inner += [one] if hasattr(one, "eqns") else []
     return inner
-
-
-def _place(equation: Any) -> str:
-    """Return the place of an equation in the user's code, as JAX summarises it."""
-    try:
-        from jax._src import source_info_util
-
-        return Path(source_info_util.summarize(equation.source_info).split(" ")[0]).name
-    except (ImportError, AttributeError):  # no public function names it
-        return "a while loop"

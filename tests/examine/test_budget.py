@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import bench
-from bench.errors import UserError
 
 examine = partial(bench.examine, progress=False)
 THETA = [0.4, 0.3, 0.5]
@@ -103,12 +102,6 @@ def test_first_calls_have_a_budget_of_their_own(now):
     assert compiled == ["cost", "grad"]
     assert report.spent.compile_s == pytest.approx(0.8, abs=0.01)
     assert report.spent.seconds < 0.4
-
-
-@pytest.mark.parametrize("calls", [0, -1, 2.5])
-def test_calls_is_a_whole_number(calls):
-    with pytest.raises(UserError, match="is not a number of calls"):
-        examine(cost, THETA, calls=calls)
 
 
 def test_a_gradient_that_is_right_at_one_theta_is_said_to_be_right_there_only():

@@ -17,7 +17,7 @@ from bench import cli
 from bench.errors import UserError
 from bench.examine import smoothing, text
 from bench.examine.lines import Break, LineScan, scan
-from bench.simulator import simulator, tree
+from bench.simulator import simulator
 from bench.simulator.simulator import Simulator
 from bench.simulator.tree import ParameterTree
 
@@ -136,12 +136,6 @@ def test_changes_of_theta_are_named_and_change_no_verdict(cost, theta, settings,
     assert [text for text in report.warnings if "in place" in text] == [
         f"{name} changes theta in place: each call gets a copy" for name in names
     ]
-
-
-def test_theta_that_would_fill_the_memory_is_bad_input(monkeypatch):
-    monkeypatch.setattr(tree, "MAX_SIZE", 100)
-    with pytest.raises(UserError, match="at most 100"):
-        ParameterTree(np.zeros(101))
 
 
 def test_scale_of_zero_is_that_of_its_array():
@@ -270,6 +264,7 @@ def test_batches_are_told_from_the_result():
         ({"batch": "column"}, "did you mean 'columns'"),
         ({"budget": "soon"}, "is not a duration"),
         ({"noise": -1}, "whole number"),
+        ({"calls": 2.5}, "is not a number of calls"),
         ({"sigma": np.float32(-0.5)}, "above 0"),
     ],
 )
@@ -349,7 +344,6 @@ def mysim(tmp_path):
     path.write_text(
         "theta = [1.0, 0.5]\n"
         "def cost(x): return x[0] ** 2 * x[1]\n"
-        "def named(p): return p['mass'] ** 2\n"
         "def right(x): return [2 * x[0] * x[1], x[0] ** 2]\n"
         "def wrong(x): return [2 * x[0] * x[1], -x[0] ** 2]\n"
         "def leaves(x): raise SystemExit(0)\n"
@@ -393,11 +387,6 @@ def test_own_arithmetic_does_not_warn_and_the_cost_still_does():
             examine(cost, [1.0])
         with np.errstate(divide="ignore"):
             str(examine(cost, [1.0], grad=lambda x: [1e308]))
-
-
-def test_command_takes_named_numbers(mysim, capsys):
-    assert cli.main(["examine", f"{mysim}:named", "theta=mass:2", "--quiet"]) == 0
-    assert "mass=2" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -74,10 +74,6 @@ def bounce():
 # ------------------------------------------------------------------------------------------------ planted faults
 
 
-def test_right_gradient_is_smooth(pendulum):
-    assert verdicts(pendulum) == {"start": {"smooth"}}
-
-
 def test_wrong_adjoint_beside_a_contact_switch_and_on_it(bounce):
     told = verdicts(Planted(bounce, grad=lambda g, _: -g))
     assert set(told) == {"start", "before", "at", "after"}
