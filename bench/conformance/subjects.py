@@ -200,11 +200,11 @@ def rng(*key: str | int) -> np.random.Generator:
     return np.random.default_rng([zlib.crc32(str(part).encode()) for part in key])
 
 
-def samples(program: Program, count: int = COLUMNS) -> tuple[np.ndarray, np.ndarray]:
-    """Return thetas near theta0, ``(d, count)``, and noise ``(n_w, count)``."""
+def samples(program: Program) -> tuple[np.ndarray, np.ndarray]:
+    """Return :data:`COLUMNS` thetas near theta0, ``(d, B)``, and noise ``(n_w, B)``."""
     draw = rng("samples", program.scene.name)
-    theta = program.theta0[:, None] + 0.1 * program.scene.sigma * draw.standard_normal((program.dim, count))
-    return theta, draw.standard_normal((program.n_noise, count))
+    theta = program.theta0[:, None] + 0.1 * program.scene.sigma * draw.standard_normal((program.dim, COLUMNS))
+    return theta, draw.standard_normal((program.n_noise, COLUMNS))
 
 
 def with_changed_column(theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,9 @@ matters in a bootstrap. SciPy's bootstrap has no strata and does not skip resamp
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +28,7 @@ DRAWS = 1000
 Interval = tuple[float, float]
 
 
-def wilson(successes: int, trials: int, z: float = Z) -> Interval:
+def wilson(successes: int, trials: int) -> Interval:
     """Return Wilson's score interval of a success rate; ``(0, 1)`` without trials.
 
     >>> [round(x, 4) for x in wilson(8, 10)]
@@ -34,9 +36,9 @@ def wilson(successes: int, trials: int, z: float = Z) -> Interval:
     """
     if trials == 0:
         return 0.0, 1.0
-    share, weight = successes / trials, z * z / trials
+    share, weight = successes / trials, Z * Z / trials
     middle = (share + weight / 2) / (1 + weight)
-    half = z / (1 + weight) * math.sqrt(share * (1 - share) / trials + weight / (4 * trials))
+    half = Z / (1 + weight) * math.sqrt(share * (1 - share) / trials + weight / (4 * trials))
     # rounding must not exclude a share of 0 or 1 itself
     low = 0.0 if successes == 0 else max(0.0, middle - half)
     return low, 1.0 if successes == trials else min(1.0, middle + half)
@@ -54,36 +56,17 @@ def _tail(sizes: Sequence[int]) -> float:
     return float(ndtr(-math.sqrt(sum(sizes) / degrees) * stdtrit(degrees, 0.975))) if degrees else 0.0
 
 
-def bootstrap(
-    strata: Sequence[np.ndarray],
-    statistic: Callable[[Sequence[np.ndarray]], float],
-    seed: int = 0,
-    draws: int = DRAWS,
-) -> Interval:
-    """Return the bootstrap percentile interval of a statistic, resampling each stratum along its first axis.
+def bootstrap(strata: Sequence[np.ndarray], statistic: Callable[[Sequence[np.ndarray]], Any]) -> tuple[Any, Any]:
+    """Return the bootstrap percentile interval of a statistic, a number or an array, resampling each stratum along its first axis.
 
     Resamples in which the statistic is NaN are ignored. The interval is NaN if all are. :func:`_tail` gives the quantiles.
     """
-    (interval,) = bootstrap_along(strata, lambda drawn: np.array([statistic(drawn)]), seed, draws)
-    return interval
-
-
-def bootstrap_along(
-    strata: Sequence[np.ndarray],
-    statistic: Callable[[Sequence[np.ndarray]], np.ndarray],
-    seed: int = 0,
-    draws: int = DRAWS,
-) -> list[Interval]:
-    """Return the intervals of :func:`bootstrap` of each number of a statistic ``(k,)``, from the same resamples."""
-    rng = np.random.default_rng(seed)
-    drawn = [statistic([part[rng.integers(0, len(part), len(part))] for part in strata]) for _ in range(draws)]
+    rng = np.random.default_rng(0)
+    drawn = [statistic([part[rng.integers(0, len(part), len(part))] for part in strata]) for _ in range(DRAWS)]
     tail = _tail([len(part) for part in strata])
-    intervals = []
-    for values in np.transpose(drawn):
-        known = values[~np.isnan(values)]
-        ends = np.quantile(known, [tail, 1.0 - tail], method="nearest") if known.size else (math.nan, math.nan)
-        intervals.append((float(ends[0]), float(ends[1])))
-    return intervals
+    with warnings.catch_warnings(action="ignore"):  # NaN in all resamples
+        low, high = np.nanquantile(drawn, [tail, 1.0 - tail], axis=0, method="nearest")
+    return low, high
 
 
 def average_runtime(spent: np.ndarray, reached: np.ndarray) -> float:
@@ -98,12 +81,12 @@ def average_runtime(spent: np.ndarray, reached: np.ndarray) -> float:
     return float(np.sum(spent) / count) if count else math.inf
 
 
-def runtime_interval(spent: np.ndarray, reached: np.ndarray, seed: int = 0, draws: int = DRAWS) -> Interval:
+def runtime_interval(spent: np.ndarray, reached: np.ndarray) -> Interval:
     """Return the bootstrap interval of :func:`average_runtime`.
 
     The upper end is infinite where too many resamples contain no success.
     """
-    drawn = np.random.default_rng(seed).integers(0, len(spent), (draws, len(spent)))
+    drawn = np.random.default_rng(0).integers(0, len(spent), (DRAWS, len(spent)))
     counts = reached[drawn].sum(axis=1)
     values = np.where(counts > 0, spent[drawn].sum(axis=1) / np.maximum(counts, 1), math.inf)
     tail = _tail([len(spent)])

@@ -270,7 +270,7 @@ def _student_quantile(probability: float, degrees: float) -> float:
     return float(ndtri(probability) if math.isinf(degrees) else stdtrit(degrees, probability))
 
 
-def variance_interval(deviations: np.ndarray, level: float = 0.95) -> tuple[float, float]:
+def variance_interval(deviations: np.ndarray) -> tuple[float, float]:
     """Return the interval of the trace of the covariance, from the deviations from the mean ``(R, d)``.
 
     The interval is the jackknife of the logarithm, which accounts for kurtosis, with the upper end of
@@ -286,10 +286,10 @@ def variance_interval(deviations: np.ndarray, level: float = 0.95) -> tuple[floa
     left = total - squares * repeats / max(repeats - 1, 1)
     if repeats < 3 or left.min() <= 1e-12 * total:  # rounding: the other repeats are all the same
         return 0.0, math.inf
-    return _jackknife(math.log(total / (repeats - 1)), np.log(left) - math.log(repeats - 2), level)
+    return _jackknife(math.log(total / (repeats - 1)), np.log(left) - math.log(repeats - 2))
 
 
-def _jackknife(whole: float, without: np.ndarray, level: float) -> tuple[float, float]:
+def _jackknife(whole: float, without: np.ndarray) -> tuple[float, float]:
     """Return the interval of a variance from its logarithm and the logarithms ``(R,)`` with one repeat omitted.
 
     The pseudo-values are as skewed as the squares they come from. Where large squares are rare, most samples contain
@@ -304,7 +304,7 @@ def _jackknife(whole: float, without: np.ndarray, level: float) -> tuple[float, 
     repeats = len(without)
     pseudo = repeats * whole - (repeats - 1) * without
     centre, spread = float(pseudo.mean()), float(pseudo.std(ddof=1))
-    reach = _student_quantile(0.5 + level / 2.0, repeats - 1) / math.sqrt(repeats)
+    reach = _student_quantile(0.975, repeats - 1) / math.sqrt(repeats)
     up = reach
     if spread > 0.0:
         skewness = repeats / (repeats - 2) * float((((pseudo - centre) / spread) ** 3).sum()) / (repeats - 1)
@@ -315,9 +315,7 @@ def _jackknife(whole: float, without: np.ndarray, level: float) -> tuple[float, 
     return _exp(min(centre - reach * spread, whole)), _exp(max(centre + up * spread, whole))
 
 
-def variance_per_sample(
-    sums: np.ndarray, squares: np.ndarray, samples: int, level: float = 0.95
-) -> tuple[float, float, float]:
+def variance_per_sample(sums: np.ndarray, squares: np.ndarray, samples: int) -> tuple[float, float, float]:
     """Return the trace of the covariance of one sample's term, with its interval, from all R x N terms.
 
     ``sums (R, d)`` are the sums of the ``samples`` terms of each repeat, ``squares (R,)`` the sums of their squared
@@ -346,7 +344,7 @@ def variance_per_sample(
     left = power - squares - np.einsum("rd,rd->r", rest, rest) / max(count - samples, 1)
     if repeats < 3 or whole <= floor or left.min() <= floor:
         return value, 0.0, math.inf
-    return value, *_jackknife(math.log(value), np.log(left) - math.log(count - samples - 1), level)
+    return value, *_jackknife(math.log(value), np.log(left) - math.log(count - samples - 1))
 
 
 def _exp(exponent: float) -> float:

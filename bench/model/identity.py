@@ -75,21 +75,18 @@ def split_items(text: str) -> list[str]:
     return parts
 
 
-def changed(plugin: Plugin, given: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return the parameter values that differ from ``given``, or from the default if ``given`` lacks the parameter."""
-    given = given or {}
+def changed(plugin: Plugin) -> dict[str, Any]:
+    """Return the parameter values that differ from the defaults."""
     return {
         name: getattr(plugin, name)
         for name, parameter in parameters(type(plugin)).items()
-        if getattr(plugin, name) != given.get(name, parameter.default)
+        if getattr(plugin, name) != parameter.default
     }
 
 
-def label(plugin: Plugin | None, given: Mapping[str, Any] | None = None, without: tuple[str, ...] = ()) -> str:
-    """Return a plugin's identity string, omitting unchanged parameters and those in ``without``; ``none`` for None."""
-    if plugin is None:
-        return "none"
-    return identity(plugin.name, {k: v for k, v in changed(plugin, given).items() if k not in without})
+def label(plugin: Plugin) -> str:
+    """Return a plugin's identity string, omitting unchanged parameters."""
+    return identity(plugin.name, changed(plugin))
 
 
 def described(plugin: Plugin | None) -> dict[str, Any] | None:

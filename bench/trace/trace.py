@@ -112,7 +112,7 @@ def _of_cell(session: Session, cell: Cell, seeded: bool) -> Trace:
         table, gradient_error = trace(session.problem(cell), w)
     except Unsupported as reason:
         raise _cannot(cell, program, str(reason)) from None
-    parts = [label(cell.parts[axis]) for axis in AXES if cell.parts[axis] is not None]
+    parts = [label(part) for axis in AXES if (part := cell.parts[axis]) is not None]
     drawn = f"noise of seed {cell.seed}" if seeded else "w = 0"
     return Trace(scene.name, ", ".join([*parts, drawn]), table, gradient_error)
 

@@ -15,7 +15,7 @@ from bench.experiment.axes import Axis, table, values_of
 from bench.experiment.columns import Column, interval, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Table, Views
-from bench.measure.performance import bootstrap, bootstrap_along, interquartile_mean
+from bench.measure.performance import bootstrap, interquartile_mean
 from bench.report.colours import method_styles
 from bench.report.problems import problem_names
 from bench.report.views import arrange, attempted
@@ -222,7 +222,7 @@ def curves_of(runs: pd.DataFrame) -> pd.DataFrame:
         costs = -np.where(np.isfinite(curves), curves, curves[:, :1])
         low, high = np.full((2, costs.shape[1]), math.nan)
         if len(part) >= MIN_SEEDS:
-            low, high = np.transpose(bootstrap_along([costs], lambda drawn: _middle(drawn[0])))
+            low, high = bootstrap([costs], lambda drawn: _middle(drawn[0]))
         steps = np.asarray(max(part["curve_step"], key=len), dtype=float)
         parts.append(pd.DataFrame(dict(zip(names, (problem, method, steps, _middle(costs), low, high), strict=True))))
     return pd.concat(parts, ignore_index=True)
