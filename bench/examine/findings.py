@@ -35,6 +35,8 @@ DIGIT = 0.1
 """Largest uncertainty of a difference that shows a derivative, relative to the derivative or to slopes nearby."""
 CONTRADICTED = 10.0
 """Uncertainties of a difference from which a derivative is not called right, even if it is small beside the others."""
+SLIGHT = 1e-5
+"""Largest error of an unresolved derivative, relative to the largest derivative, both in units of the inputs' scales."""
 DEVIATIONS = 4.0
 """Standard deviations of the slope along a random direction that errors within the tolerance do not exceed."""
 SEEN_ALONE = 4.0
@@ -393,6 +395,7 @@ class Findings:
             # so small an error that adaptive steps may explain it, and the budget ended before that was known
             is_open = explained.is_adaptive is None and not explained.gaps and may_be_adaptive(self.check)
             yield "undecided", is_open and failed in SUSPICIOUS, f"{numbers}: adaptive steps may explain it"
+            yield "unresolved", failed in SUSPICIOUS and self._is_slight, numbers
             yield failed, True, numbers
         yield "undecided", not check.components or not self.is_complete, scope
         # no larger step is left than that with the best central difference
@@ -504,6 +507,16 @@ class Findings:
         return bool(wrong) and all(
             not part.sample.differences.any() and abs(part.program) * part.sample.scale <= RESIDUE * height
             for part in wrong
+        )
+
+    @property
+    def _is_slight(self) -> bool:
+        """Whether the wrong numbers move the cost so little beside the others that an error of a solver may be as large."""
+        check = self.wrong_checks[0]
+        largest = max((abs(part.difference) * part.sample.scale for part in check.components), default=0.0)
+        wrong = [part for part in (*check.parts, *check.draws) if part.verdict in UNEQUAL]
+        return bool(wrong) and all(
+            abs(part.program - part.difference) * part.sample.scale <= SLIGHT * largest for part in wrong
         )
 
     @property

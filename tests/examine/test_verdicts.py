@@ -74,6 +74,14 @@ def with_small(second):
     return lambda x: [1e6 * np.cos(x[0]), second, 1.0]
 
 
+def residue(size):
+    return lambda x: float(np.sin(x[0]) - size * x[1])
+
+
+def by_size(second):
+    return lambda x: [np.cos(x[0]), second]
+
+
 def bent(bend):
     """The slope changes at theta by little, where 9 steps of a decade do not show it over three decades of noise."""
 
@@ -177,6 +185,9 @@ CASES = {
     "a float32 cost far from zero": (3, "", single, scaled(-1.0, smooth_slope), {"theta": POINT, "calls": 800}),
     "a small component": (0, "", small_slope, with_small(1e-6), {"theta": POINT, "calls": 1500}),
     "a small component that is wrong": (3, "unresolved", small_slope, with_small(1e-3), {"theta": POINT, "calls": 1500}),
+    "what a solver leaves of a derivative of 0": (3, "unresolved", residue(1e-6), by_size(8e-8), {}),
+    "a hundred times as much": (1, "", residue(1e-4), by_size(8e-6), {}),
+    "0 beside a small slope": (1, "disconnected", residue(1e-6), by_size(0.0), {}),
     "few calls beside a kink": (3, "unsettled", lambda x: float(5.0 * max(x[0] - 0.3 - 1e-9, 0.0) + np.sin(x[1])),
                                 lambda x: [5.0, np.cos(x[1])], {"theta": [0.3, 0.2], "calls": 30}),
     "a small kink": (1, "kink", bent(3e-4), side(3e-4, 1.0), {"theta": [0.3, 0.9], "calls": 1500}),
