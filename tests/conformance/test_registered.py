@@ -185,6 +185,10 @@ EVERYWHERE = {"mode", "integrator", "gradient", "differences"}
 """Parameters of engines that act without contacts, which are all that the kit runs with other parameters than the defaults."""
 
 
+REPEATED = ("columns_are_independent", "single_precision_is_finite")
+"""Checks that an engine which compiles for seconds has on every program only: they need other batches than its gradient."""
+
+
 def is_run(plugin, check):
     """Whether a check runs on few short programs: of those that take long with other parameters, gradients only."""
     if not is_long(plugin, check):
@@ -192,7 +196,8 @@ def is_run(plugin, check):
     if check in ("value_agrees", "backends_agree", something_was_checked.__name__):
         return False
     if not is_varied(plugin) or check != "gradient_is_that_of_value":
-        return not is_varied(plugin)
+        is_engine = getattr(plugin, "compiles", False) and "physics" in plugin.provides
+        return not is_varied(plugin) and not (is_engine and check in REPEATED)
     return "physics" not in plugin.provides or bool(EVERYWHERE & set(changed(plugin)))
 
 
