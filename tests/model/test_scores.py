@@ -86,7 +86,7 @@ def test_estimators_that_need_scores_are_refused_in_one_sentence(tmp_path):
     rows = bench.run(
         name="mine", plugins=str(tmp_path / "mine"), results_dir=str(tmp_path / "out"), scenes=["gusts"],
         integrators=["semi_implicit_euler"], backends=["numpy"], estimators=["fobg", "reinforce", "alpha_order"],
-        samples=8, repeats=16, workers=0,
+        samples=8, repeats=16, workers=0, timing=False, formats=[],
     ).set_index("estimator")  # fmt: skip
     assert dict(rows["status"]) == {"fobg": "ok", "reinforce": "unsupported", "alpha_order": "unsupported"}
     for name in ("reinforce", "alpha_order"):
