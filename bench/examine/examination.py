@@ -150,7 +150,10 @@ def examine(
 
 
 def _levels(sigma: Any, layout: ParameterTree) -> list[tuple[float, np.ndarray]]:
-    rows = [sigma] if isinstance(sigma, Mapping | str) else np.atleast_1d([] if sigma is None else sigma)
+    try:
+        rows = [sigma] if isinstance(sigma, Mapping | str) else np.atleast_1d([] if sigma is None else sigma)
+    except ValueError:
+        raise UserError(f"sigma={sigma} is not valid: give a number, or a list of numbers") from None
     every = [layout.spread(one, "sigma", 0.0) for one in rows]
     if not all(np.isfinite(one).all() and (one >= 0).all() and one.any() for one in every):
         raise UserError(f"sigma={sigma} is not valid: sigma has standard deviations of noise on theta, numbers above 0")

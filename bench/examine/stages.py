@@ -46,7 +46,7 @@ MOST_OF_IT = 0.9
 """Share of the remaining budget after which a running stage is stopped."""
 SHARE = 0.8
 """Largest share of the remaining budget of a stage before the last."""
-BEFORE_NOISE = 0.6
+BEFORE_NOISE = 0.4
 """Largest share of the last stage on a gradient that looks right, where noise is measured after it."""
 STATE = 0.1
 """Largest share of the difference between histories by which a cost with equal histories differs."""

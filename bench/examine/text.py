@@ -44,7 +44,9 @@ def conclusion(report: Findings) -> str:
         return f"Derivative: {report.derivative.upper()}. {problems(report)[0]}"
     fact = report.n_checked + ", at this theta only" * (not report.check.draws)
     if report.derivative == RIGHT:
-        fact += f", {len(report.resolved_parts)} of them to {number(100 * report.resolution, 1)}%"
+        parts = report.resolved_parts
+        within = max((max(part.error, part.uncertainty / abs(part.difference)) for part in parts), default=0.0)
+        fact += f", {len(parts)} of them to {number(100 * within, 1)}%" * bool(parts)
     small = [part for part in report.small_errors if part.component is not None] or report.small_errors
     off = f" within the tolerance, off by up to {number(100 * small[0].distance)}%" if small else ""
     fact = report.mean_text if report.derivative_cause == "estimator" else fact

@@ -180,7 +180,7 @@ EXAMINATION = {
     "unresolved": Rule(
         "open", "rounding or noise of the cost hides its slope at every step, or contradicts a small derivative",
         "right, but the error of the difference is above {findings.DIGIT:.0%} of it, or both are {findings.CONTRADICTED:g} errors and "
-        "{findings.DIGIT:.0%} apart; or wrong and not 0, by less than {findings.SLIGHT:g} of the largest derivative",
+        "{findings.DIGIT:.0%} apart; or not 0 and below {findings.PART:.0%} of a difference that is below about {findings.SLIGHT:g} of the largest right derivative",
     ),
     "adaptive": Rule(
         "open", "gradient and differences differ by as much as the discretisation does, as with adaptive steps: neither is "

@@ -266,6 +266,7 @@ def test_batches_are_told_from_the_result():
         ({"noise": -1}, "whole number"),
         ({"calls": 2.5}, "is not a number of calls"),
         ({"sigma": np.float32(-0.5)}, "above 0"),
+        ({"sigma": [[0.1, 0.2], 0.3]}, "a list of numbers"),
     ],
 )
 def test_bad_settings_say_what_is_allowed(settings, match):

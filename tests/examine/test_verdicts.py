@@ -186,6 +186,10 @@ CASES = {
     "a small component": (0, "", small_slope, with_small(1e-6), {"theta": POINT, "calls": 1500}),
     "a small component that is wrong": (3, "unresolved", small_slope, with_small(1e-3), {"theta": POINT, "calls": 1500}),
     "what a solver leaves of a derivative of 0": (3, "unresolved", residue(1e-6), by_size(8e-8), {}),
+    "the same is not expected away": (3, "unresolved", residue(1e-6), by_size(8e-8), {"expect": "unresolved"}),
+    "a small slope with the wrong sign": (1, "", residue(1e-6), by_size(1e-6), {}),
+    "a small slope beside an undefined one": (
+        1, "", lambda x: float(x[0] > 0.9) + 3e-9 * np.sin(x[1]), lambda x: [0.0, 1e-9 * np.cos(x[1])], {"theta": [0.9, 0.3]}),
     "a hundred times as much": (1, "", residue(1e-4), by_size(8e-6), {}),
     "0 beside a small slope": (1, "disconnected", residue(1e-6), by_size(0.0), {}),
     "few calls beside a kink": (3, "unsettled", lambda x: float(5.0 * max(x[0] - 0.3 - 1e-9, 0.0) + np.sin(x[1])),
