@@ -40,7 +40,8 @@ def run(experiment: str | Sequence[str] = (), **settings: Any) -> pd.DataFrame:
     words = [f"experiment={experiment}"] if isinstance(experiment, str) and experiment else list(experiment)
     resolved = config.load(words, settings=settings)
     finished = execute(resolved)
-    given = [*words, *(f"{key}={value}" for key, value in settings.items())]
+    texts = {key: value if isinstance(value, str) else config.as_json(key, value) for key, value in settings.items()}
+    given = [*words, *(f"{key}={text}" for key, text in texts.items())]
     rows = finish(finished, given)[0] if resolved.execution.shard is None else finished.rows()
     return with_axes(resolved.sweep, rows).reset_index(drop=True)
 

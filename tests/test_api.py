@@ -59,7 +59,7 @@ def test_run_returns_a_row_per_cell_and_writes_everything(rows, results):
     names = {path.name for path in (results / "notes").iterdir()}
     assert {"rows.parquet", "bias_variance.csv", "bias_variance.md", "report.html", "run.json"} <= names
     told = json.loads((results / "notes" / "run.json").read_text())
-    assert "scene={'quadratic': {'dimension': 3}}" in told["argv"]
+    assert 'scene={"quadratic":{"dimension":3}}' in told["argv"]
     assert told["config"]["sweep"] == {"sigma": [0.1, 0.2], "condition": [10.0, 100]}
 
 
@@ -270,3 +270,17 @@ def test_examples_in_docstrings(name):
     done = doctest.testmod(importlib.import_module(f"bench.{name}"))
     assert done.attempted > 0
     assert done.failed == 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ({"plugins": ""}, "must be folders"),
+        ({"plugins": 3}, "must be folders"),
+        ({"scene": {("a",): 1}}, "keys must be"),
+        ({"scene": {np.int64(1): 2}}, "keys must be"),
+    ],
+)
+def test_settings_of_python_that_cannot_be_read_are_named(settings, told):
+    with pytest.raises(bench.UserError, match=told):
+        bench.run(name="mine", **settings)

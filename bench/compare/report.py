@@ -117,7 +117,7 @@ def cell_names(table: pd.DataFrame) -> list[str]:
             flat, lines = flat_rows(part)
             flat = flat.iloc[lines].set_axis([f"{plugin or axis}.{name}" for axis, plugin, name in flat], axis=1)
             every = flat.set_axis(part.index).assign(**part[[*COUNTS]])
-            differing = every.loc[:, every.astype(str).nunique() > 1].map(
+            differing = every.loc[:, every.astype(str).nunique(dropna=False) > 1].map(
                 lambda one: one if isinstance(one, str | int | float) else str(one)
             )
             names[part.index] = names[part.index] + ", " + titled(differing, [*differing])

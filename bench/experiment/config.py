@@ -67,6 +67,8 @@ def load(
     too. ``settings`` are further settings as values of Python.
     """
     folders = _as_list((settings or {}).get("plugins"))
+    if not all(isinstance(folder, str | Path) and str(folder) for folder in folders):
+        raise UserError(f"plugins={folders} must be folders; the current one is plugins=.")
     for key, _, value in (word.lstrip("+").partition("=") for word in words):
         if key == "plugins":
             if not names_of(value) and not value.startswith("["):
@@ -91,13 +93,21 @@ def _of_python(key: str, value: Any) -> Override:
     _check_key(key)
     if isinstance(value, str) and key in _name_lists():
         return [key], names_of(value)
-    plain = json.dumps(
-        value,
-        default=lambda one: (
-            one.tolist() if hasattr(one, "tolist") else list(one) if isinstance(one, range) else str(one)
-        ),
-    )
-    return key.split("."), json.loads(plain)
+    return key.split("."), json.loads(as_json(key, value))
+
+
+def as_json(key: str, value: Any) -> str:
+    """Return a setting given in Python as JSON; raises :class:`UserError` for a table whose keys are no strings."""
+    try:
+        return json.dumps(
+            value,
+            separators=(",", ":"),
+            default=lambda one: (
+                one.tolist() if hasattr(one, "tolist") else list(one) if isinstance(one, range) else str(one)
+            ),
+        )
+    except TypeError as error:
+        raise UserError(f"{key}={value}: {error}") from None
 
 
 def _composed(overrides: Sequence[Override], config_dirs: Sequence[Path]) -> Experiment:
@@ -209,6 +219,8 @@ def _parsed(word: str, config_dirs: Sequence[Path]) -> Override:
     key, _, value = word.partition("=")
     bare = key.lstrip("+~")
     if bare == "experiment":
+        if not names_of(value):
+            raise UserError(f"'{word}' names no experiment; python -m bench --help lists them")
         return [bare], value
     if key.startswith("~") or bare.partition(".")[0].partition("/")[0] == "hydra":
         raise UserError(f"'{word}': Hydra's own settings cannot be changed")

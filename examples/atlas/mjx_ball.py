@@ -9,7 +9,7 @@ about = {
     "package": "mujoco-mjx",
     "python": "bench",
     "requires": "mujoco-mjx mujoco",
-    "examine": "grad=jax calls=600",
+    "examine": "grad=jax calls=900",
     "derivative": "right",
     "jumps": "jumps",
     "how": "documented contact model",

@@ -22,7 +22,7 @@ MANY = ",".join(map(str, range(2, 220)))
 ADDRESS = "is an address, and files are written on this machine"
 REFUSED = {
     # names
-    "+experiment=stifness_sweep": "did you mean 'stiffness_sweep'", "scenes=[pushng]": "did you mean 'pushing'",
+    "+experiment=stifness_sweep": "did you mean 'stiffness_sweep'", "+experiment=": "names no experiment", "scenes=[pushng]": "did you mean 'pushing'",
     "scenes=[pushing] sweep.stifness=[1e3]": "did you mean 'stiffness'", "nonsense=1": "(allowed: ", "rum": "did you mean 'run'",
     "scenes=[pushing] scene.pushing.mas=0.2": "did you mean 'mass'",
     "--verison": "unknown option '--verison'; did you mean '--version'?", "report quik": "unknown experiment 'quik'; did you mean 'quick'?",

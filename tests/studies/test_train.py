@@ -70,6 +70,19 @@ def test_a_setting_is_chosen_on_seeds_that_are_not_reported():
     assert summary.loc["shac[window=8]", "final"] > summary.loc["shac", "final"]
 
 
+@pytest.mark.parametrize(("count", "reported"), [(5, 5), (7, 7), (8, 5), (10, 6)])
+def test_seeds_choose_only_where_enough_are_left_for_a_test(count, reported):
+    summary = tables_of(*made_up(seeds=range(count)))["summary"].frame
+    assert set(summary["seeds"]) == {reported}
+    assert summary["final_low"].notna().all()
+
+
+def test_a_setting_without_a_tuning_run_is_not_chosen():
+    experiment, rows = made_up({"shac": -400.0, "shac[window=8]": -500.0, "ppo": -900.0}, range(9), spread=1.0)
+    rows = rows[(rows["trainer"] != "shac[window=8]") | (rows["seed"] >= 3)]
+    assert verdicts_of(experiment, rows) == {"shac": "first", "shac[window=8]": "not chosen", "ppo": "behind"}
+
+
 def test_few_seeds_give_no_interval_and_no_order():
     experiment, rows = made_up(seeds=range(4))
     shown = studied.views(experiment, rows)

@@ -53,6 +53,7 @@ Verdict = dict[str, Any]
 """A fault: its ``code``, the ``value`` that shows it, and the ``update`` where it starts if it has one."""
 
 
+@np.errstate(all="ignore")
 def judge(run: Mapping[str, Any]) -> list[Verdict]:
     """Return the faults that a stored run shows, in the order of :data:`MEANINGS`; empty for a healthy run.
 
@@ -76,25 +77,24 @@ def judge(run: Mapping[str, Any]) -> list[Verdict]:
     best = np.argmax(np.nan_to_num(mean, nan=-math.inf))
     lost = mean[best] - mean[-1]
     outside = np.flatnonzero((deviation < DEVIATIONS[0]) | (deviation > DEVIATIONS[1]))
-    with np.errstate(all="ignore"):
-        deeper = depth[-tenth:].mean() / depth[:tenth].mean()
-        is_used = tenth > 1 and DOUBLED < deeper < math.inf and all(
-            _is_below(values[:tenth], values[-tenth:]) for values in (reward, depth)
-        )  # fmt: skip
-        faults = {
-            "not_finite": (bad, math.nan, bad[-1:]),
-            "zero": (np.isfinite(norms).all() and silent > SILENT, silent, updates[[norms.argmin()]]),
-            "explodes": (norms.max() > PEAK * usual > 0, norms.max() / usual, updates[[norms.argmax()]]),
-            "grows": (late > FACTOR * first > 0, late / first, updates[norms > FACTOR * first]),
-            "vanishes": (has_vanished, late / early, [small]),
-            "differences": (error > DISAGREES, error, []),
-            "opposed": (len(cosines) >= MIN_CHECKS and mean_interval(cosines)[2] < 0, cosines.sum() / len(cosines), []),
-            # the last return is far below the best one, whatever the loss does
-            "falls": (high[-1] < low[best] and lost > LOST * (mean[best] - mean[0]), lost, [run["curve_update"][best]]),
-            "soft_contact": (is_used, deeper, []),
-            "parameters": (largest.max() > GROWN * largest[0], largest.max() / largest[0], updates[largest > GROWN * largest[0]]),
-            "deviation": (outside.size, deviation[outside[:1]].sum(), updates[outside]),
-        }  # fmt: skip
+    deeper = depth[-tenth:].mean() / depth[:tenth].mean()
+    is_used = tenth > 1 and DOUBLED < deeper < math.inf and all(
+        _is_below(values[:tenth], values[-tenth:]) for values in (reward, depth)
+    )  # fmt: skip
+    faults = {
+        "not_finite": (bad, math.nan, bad[-1:]),
+        "zero": (np.isfinite(norms).all() and silent > SILENT, silent, updates[[norms.argmin()]]),
+        "explodes": (math.inf > norms.max() > PEAK * usual > 0, norms.max() / usual, updates[[norms.argmax()]]),
+        "grows": (late > FACTOR * first > 0, late / first, updates[norms > FACTOR * first]),
+        "vanishes": (has_vanished, late / early, [small]),
+        "differences": (error > DISAGREES, error, []),
+        "opposed": (len(cosines) >= MIN_CHECKS and mean_interval(cosines)[2] < 0, cosines.sum() / len(cosines), []),
+        # the last return is far below the best one, whatever the loss does
+        "falls": (high[-1] < low[best] and lost > LOST * (mean[best] - mean[0]), lost, [run["curve_update"][best]]),
+        "soft_contact": (is_used, deeper, []),
+        "parameters": (largest.max() > GROWN * largest[0], largest.max() / largest[0], updates[largest > GROWN * largest[0]]),
+        "deviation": (outside.size, deviation[outside[:1]].sum(), updates[outside]),
+    }  # fmt: skip
     return [
         {"code": code, "value": float(value)} | ({"update": int(where[0])} if len(where) else {})
         for code, (is_fault, value, where) in faults.items() if is_fault

@@ -76,7 +76,8 @@ WINDOW_NOTE = (
 )
 FAULT_NOTE = "update: where it starts. value:"
 VERDICTS = (
-    "settings: how many of the trainer were tried. The best on the first third of the seeds is chosen, the other seeds are reported. "
+    "settings: how many of the trainer were tried. The best on the first third of the seeds is chosen, the other seeds are reported; "
+    "of fewer than 8 seeds all are reported, and choose. "
     "verdict: first, tied (not distinguishable), behind (by a Mann-Whitney test at 5%), not chosen, or open: none is behind, or only "
     "the first's larger number of settings puts it ahead (it would lead with the worst of as many settings)."
 )
@@ -156,8 +157,9 @@ def split(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
     None chooses where each trainer has one setting, and where too few would be left for a test.
     """
     seeds = sorted(runs["seed"].unique())
-    several = (runs.groupby(["problem", "family"])["method"].nunique() > 1).any() and len(seeds) > MIN_SEEDS
-    chooses = runs["seed"].isin(seeds[: math.ceil(len(seeds) / 3)] if several else [])
+    several = (runs.groupby(["problem", "family"])["method"].nunique() > 1).any()
+    count = math.ceil(len(seeds) / 3)
+    chooses = runs["seed"].isin(seeds[:count] if several and len(seeds) - count >= MIN_SEEDS else [])
     return runs[chooses], runs[~chooses]
 
 
@@ -166,7 +168,7 @@ def tried(lines: pd.DataFrame, tuning: pd.DataFrame) -> pd.DataFrame:
     returns = {key: interquartile_mean(final_returns(part)) for key, part in tuning.groupby(["problem", "method"])}
     keys = zip(lines["problem"], lines["method"], strict=True)
     settings = lines.groupby(["problem", "family"])["method"].transform("size")
-    return lines.assign(settings=settings, tuned=[returns.get(key, 0.0) for key in keys])
+    return lines.assign(settings=settings, tuned=[returns.get(key, -math.inf) for key in keys])
 
 
 def ranked(lines: pd.DataFrame, by: Sequence[str], trainer: str = "family") -> pd.Series:
