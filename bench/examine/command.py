@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bench.errors import UserError, local_path, unknown
 from bench.examine import UPDATE
-from bench.examine.examination import examine
+from bench.examine.examination import KEY, examine
 from bench.examine.report import Report
 from bench.simulator import imports
 from bench.simulator.simulator import LIBRARIES
@@ -24,6 +26,8 @@ SETTINGS = [name for name in inspect.signature(examine).parameters if name not i
 ]
 """Settings of one cost."""
 QUIET = "--quiet"
+COMPILED = Path("~/.cache/diffsim-bench/jax").expanduser()
+"""Folder of programs that JAX has compiled, as a simulator may compile for minutes."""
 
 
 def run(words: Sequence[str]) -> Report:
@@ -41,6 +45,7 @@ def run(words: Sequence[str]) -> Report:
             raise unknown("setting of examine", key, SETTINGS)
         if key in FILES:
             local_path(key, settings[key])
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(COMPILED))  # which JAX reads when it is imported
     report = _examined(names[0], settings, QUIET not in words)
     if "baseline" in settings:
         report = report.compared(settings["baseline"], UPDATE in words)
@@ -79,6 +84,8 @@ def _value(key: str, given: str, module: Any) -> Any:
         case "theta" | "scale" if re.fullmatch(r"[A-Za-z_][\w.]*", given):
             theta = imports.load_attribute(given, module, "theta")
             return theta() if callable(theta) else theta
+        case "noise" if given == KEY:
+            return given
         case "noise" | "seed" | "calls":
             if not re.fullmatch(r"\d+", given):
                 raise UserError(f"{key}={given} is not a whole number of at least {int(key == 'calls')}")

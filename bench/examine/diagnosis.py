@@ -64,6 +64,8 @@ class Horizon(NamedTuple):
     """Largest |gradient - difference|, relative to the largest difference, in units of each input's scale."""
     uncertainty: float
     """The error of the differences, relative to the largest."""
+    norm: float
+    """Norm of the gradient, in units of each input's scale."""
 
     def is_wrong(self, tolerance: float) -> bool:
         """Return whether the error is above a tolerance and twice its uncertainty."""
@@ -148,7 +150,9 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
         numbers = [(part.program, part.difference, part.uncertainty) for part in outcome.parts]
         program, differences, doubts = np.array(numbers).T * space.scale
         size = float(np.abs(differences).max()) or 1.0
-        result.append(Horizon(steps, float(np.abs(program - differences).max() / size), float(doubts.max() / size)))
+        norm = float(np.linalg.norm(gradient * stages.scale))
+        error = float(np.abs(program - differences).max() / size)
+        result.append(Horizon(steps, error, float(doubts.max() / size), norm))
     return result
 
 

@@ -48,6 +48,8 @@ FEWEST_POINTS = 17
 """Fewest points of a line scan."""
 HELD = 20_000_000
 """Most numbers in the thetas of the pairs of one sigma, since memory stores several copies."""
+KEY, WORDS_OF_A_KEY = "key", 2
+"""Noise that is a key of JAX, and its number of words."""
 MOST_NOISY = 50_000
 """Most numbers of theta for which noise is measured."""
 
@@ -57,7 +59,7 @@ def examine(
     theta: Any,
     grad: str | Callable[..., Any] | None = None,
     sigma: Any = (),
-    noise: int = 0,
+    noise: int | str = 0,
     budget: float | str | None = None,
     batch: str | int | None = None,
     scale: Any = None,
@@ -80,8 +82,8 @@ def examine(
     arrays and numbers. ``grad`` is ``"jax"``, ``"torch"`` or a function of theta. Without ``grad``, only the cost is
     examined, by differences. ``sigma`` is one or more standard deviations of noise on theta: numbers, or per input a
     mapping such as ``{"mass": 0.1}``, theta's structure, or an array ``(levels, d)``. With ``noise=n`` the call is
-    ``cost(theta, w)``, where ``w (n,)`` is standard normal, the simulator's own randomness. Costs that are compared
-    have the same w.
+    ``cost(theta, w)``, where ``w (n,)`` is standard normal, the simulator's own randomness, with ``noise="key"``
+    ``cost(theta, key)`` with a key of ``jax.random``. Costs that are compared have the same w or key.
 
     ``budget`` is the time limit of the whole examination in seconds or as text (``60``, ``"2m"``), 60 s by default.
     ``calls`` limits the number of costs and gradients together; without ``budget`` it makes the report independent of the machine.
@@ -112,8 +114,10 @@ def examine(
         math.inf if calls is None else float(calls),
         parse_duration(compile_budget, "compile_budget"),
     )
+    if isinstance(noise, str) and noise == KEY:
+        noise, (cost, grad, refined) = WORDS_OF_A_KEY, map(_with_key, (cost, grad, refined))
     if not isinstance(noise, int | np.integer) or noise < 0:
-        raise UserError(f"noise={noise} is not the length of w in cost(theta, w): give a whole number")
+        raise UserError(f"noise={noise} is not the length of w in cost(theta, w): give a whole number, or {KEY}")
     layout = ParameterTree(theta)
     with np.errstate(over="ignore"):
         scales = layout.scales()
@@ -190,6 +194,21 @@ def _with_own_warnings(function: Any) -> Any:
             return function(*arguments, **settings)
 
     return call
+
+
+def _with_key(function: Any) -> Any:
+    """Return a function of theta and a key of JAX as one of theta and the normal numbers whose bits are the key."""
+    if not callable(function):
+        return function
+
+    @wraps(function)
+    def keyed(theta: Any, w: Any, **settings: Any) -> Any:
+        import jax
+
+        words = jax.lax.bitcast_convert_type(jax.numpy.asarray(w, dtype="float32"), "uint32")
+        return function(theta, jax.random.wrap_key_data(words), **settings)
+
+    return keyed
 
 
 def _takes_steps(function: Callable[..., Any]) -> bool:

@@ -155,7 +155,7 @@ def write(report: Findings) -> str:
         [f"checked: {_checked(report)}", f"not checked: {'; '.join(_unchecked(report))}", f"next: {step}" * bool(step)],
         _head(report),
         table("The derivative, by the program and by differences:", derivatives),
-        table("The gradient after fewer or more steps, error and uncertainty over the largest difference:",
+        table("The gradient after fewer or more steps, error and uncertainty over the largest difference, norm in units of the scales:",
               [one._asdict() for one in report.explained.growth]),
         table(f"Lines through theta, +-{REACH:g} sigma (sigma = {report.setup.shown(report.setup.reach)} {unit}):", report.line_rows()),
         table("Jumps and kinks on these lines, at t in sigma:", report.break_rows()),

@@ -441,3 +441,30 @@ def test_the_advice_compares_the_gradient_without_noise_and_mirrored_draws():
     assert methods[0.5]["mirrored"].calls < methods[0.5]["gradient"].calls
     assert reports[0.1].recommended(reports[0.1].smoothed[0]).name == "plain"
     assert reports[0.5].recommended(reports[0.5].smoothed[0]).name != "plain"
+
+
+def test_noise_may_be_a_key_of_jax():
+    jax = pytest.importorskip("jax")
+
+    def cost(x, key):
+        return (x[0] + 0.1 * jax.random.normal(key)) ** 2
+
+    def slope(x, key):
+        return 1.5 * jax.grad(cost)(x, key)
+
+    given = {"noise": "key", "sigma": 0.1, "calls": 4000, "progress": False}
+    report = bench.examine(cost, [1.0], grad="jax", **given)
+    assert (report.derivative, report.use) == ("right", "usable"), str(report)
+    assert bench.examine(cost, [1.0], grad=slope, **given).status == 1
+
+
+def test_the_norm_of_the_gradient_is_shown_at_each_horizon():
+    def cost(x, steps=10):
+        return float(np.exp(0.1 * steps * x[0]))
+
+    def slope(x, steps=10):
+        return [0.1 * steps * cost(x, steps)]
+
+    report = bench.examine(cost, [0.5], grad=slope, horizons=[10, 40], calls=400, progress=False)
+    norms = [one.norm for one in report.explained.growth]
+    np.testing.assert_allclose(norms, [0.5 * slope([0.5], steps)[0] for steps in (10, 40)])
