@@ -576,7 +576,9 @@ class Findings:
     def missed_text(self) -> str:
         """How much of the cost's change the gradient misses, and what jumps of one height at even distances show."""
         tread = f"; jumps of one height, {number(self.tread)}, at even distances on every line" if self.tread else ""
-        missed = f"along a line the integral of the gradient misses {number(100 * self.missed)}% of the change"
+        count = max((len(line.jumps) for line in self.lines if line.missed == self.missed), default=0)
+        jumps = f" with {counted(count, 'jump')}" * bool(count)
+        missed = f"along a line{jumps} the integral of the gradient misses {number(100 * self.missed)}% of the change"
         return missed * bool(self.missed) + tread
 
     @property
