@@ -289,3 +289,9 @@ def test_groups_cover_every_number_once():
         groups = groups_of(layout, layout.scales(), 0)
         assert [i for g in groups for i in range(g.first, g.last)] == list(range(layout.vector.size))
         assert len(groups) <= 16
+
+
+def test_a_cost_that_depends_on_the_call_before_is_named():
+    given = mechanisms.WarmStarted()
+    report = bench.examine(given.cost, [1.0, 2.0], grad=given.gradient, calls=3000, progress=False)
+    assert "the cost depends on the call before it" in report.spread_text
