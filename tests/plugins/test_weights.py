@@ -16,6 +16,8 @@ from classes import (
 )
 
 from bench.model import compose
+from bench.model.design import sums_of_units
+from bench.model.estimator import less_others
 
 EXACT = 1e-12
 """The same few operations in another order."""
@@ -97,3 +99,10 @@ def test_zeroth_order_per_action_has_the_policys_gradient_as_its_mean(policy, mo
         spread = found.std(axis=0, ddof=1) / np.sqrt(len(found))
         # 4.5 standard errors: below 1e-5 by chance
         assert (np.abs(found.mean(axis=0) - mean) < 4.5 * np.hypot(spread, error)).all()
+
+
+@pytest.mark.parametrize("unit", [1, 2, 3])
+def test_costs_are_less_the_mean_of_the_samples_in_other_units(unit):
+    costs = np.random.default_rng(1).standard_normal((2, 6))
+    own = sums_of_units(costs, unit)
+    assert less_others(costs, unit) == pytest.approx(costs - (costs.sum(axis=1, keepdims=True) - own) / (6 - unit))
