@@ -3,7 +3,9 @@
 import jax
 import numpy as np
 from mujoco import MjModel, mjx
+from mujoco_ball import truth
 
+__all__ = ["about", "cost", "theta", "truth"]
 jax.config.update("jax_enable_x64", True)
 about = {
     "package": "mujoco-mjx",
@@ -26,13 +28,3 @@ def cost(p):
     """Return the height after 0.1 s."""
     start = mjx.make_data(model).replace(qpos=p[:1], qvel=p[1:])
     return jax.lax.scan(lambda d, _: (mjx.step(model, d), None), start, None, 50)[0].qpos[0]
-
-
-def truth():
-    """Return the derivative: a spring and damper by `solref`, and a tenth of gravity, in touch."""
-    x, v = (theta + 1e-30j * np.eye(2)).T
-    for _ in range(50):
-        pushed = -0.981 + 0.9 * (-2 / 0.018 * v - 0.9 * x / 0.018**2)
-        v = v + 0.002 * np.where((x.real < 0) & (pushed.real > -9.81), pushed, -9.81)
-        x = x + 0.002 * v
-    return x.imag / 1e-30
