@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -65,6 +66,88 @@ class Integral:
     note: str = ""
 
 
+class _NotFinite(Exception):
+    """A cost within the limits of integration is not finite."""
+
+
+@dataclass(frozen=True)
+class _Integrand:
+    """The integrand [f(w) - f(0)] w / sigma of a problem at ``theta (d,)``; its cost is evaluated ``columns`` points at a time."""
+
+    problem: Problem
+    theta: np.ndarray
+    columns: int
+
+    @property
+    def width(self) -> int:
+        """Number of noise dimensions."""
+        return self.problem.program.n_noise
+
+    @cached_property
+    def centre(self) -> float:
+        """The cost f(0). As E[w] = 0, subtracting it does not change the integral, and loses fewer digits."""
+        return float(self.problem.value(self.theta, np.zeros((self.width, 1)))[0])
+
+    def cost(self, nodes: np.ndarray) -> np.ndarray:
+        """Return f(w) at ``nodes (width, B)``: ``(B,)``."""
+        return in_columns(lambda w: self.problem.value(self.theta, w), nodes, self.columns)
+
+    def excess(self, nodes: np.ndarray) -> np.ndarray:
+        """Return f(w) - f(0) at ``nodes (width, B)``: ``(B,)``."""
+        return self.cost(nodes) - self.centre
+
+    def edges(self, limits: _Limits) -> list[np.ndarray]:
+        """Return per axis the limits and the scene's breakpoints between them, in standard deviations."""
+        breaks, edges = self.problem.program.breakpoints(), []
+        for i, (low, high) in enumerate(zip(limits.low, limits.high, strict=True)):
+            inner = [(b - self.theta[i]) / self.problem.sigma for b in (breaks[i] if i < len(breaks) else ())]
+            edges.append(np.unique([low, *(b for b in inner if low < b < high), high]))
+        return edges
+
+    def along(self, peak: np.ndarray, axis: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Return f(w) - f(0) on the line through ``peak (width,)`` along ``axis (width,)``, at distances ``t (B,)``."""
+        return self.excess(peak[:, None] + np.outer(axis, t))
+
+    def unknown(self, note: str, points: int = 0, spacing: float = 0.0) -> Integral:
+        """Return an integral without a value."""
+        return Integral(np.full(self.problem.dim, math.nan), math.nan, points, spacing, note)
+
+
+@dataclass(frozen=True)
+class _Level:
+    """The mean of four shifted rules with about equal panels, and what their points show of the integrand."""
+
+    mean: np.ndarray
+    spread: float
+    """Largest distance of a rule from the mean."""
+    points: int
+    size: float
+    """Norm of the largest integral of absolute values."""
+    densest: float
+    """Largest value of |f(w) - f(0)| exp(-|w|^2 / 2)."""
+    peak: np.ndarray
+    """The point ``(width,)`` of that value."""
+    change: float = math.inf
+    """Change of the mean from the level before."""
+
+    @property
+    def error(self) -> float:
+        """The stated error of the mean, before rounding."""
+        return max(2.0 * self.spread, self.change)
+
+    @property
+    def norm(self) -> float:
+        """The norm of the mean."""
+        return float(np.linalg.norm(self.mean))
+
+    def after(self, coarser: _Level) -> _Level:
+        """Return this level with its change from a coarser one, and with the sizes and the peak that both show."""
+        peak = self if self.densest > coarser.densest else coarser
+        change = float(np.linalg.norm(self.mean - coarser.mean))
+        size = max(self.size, coarser.size)
+        return replace(self, change=change, size=size, densest=peak.densest, peak=peak.peak)
+
+
 def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) -> Integral | None:
     """Return the smoothed gradient E[(f(w) - f(0)) w] / sigma for one- or two-dimensional noise on theta, by quadrature.
 
@@ -77,104 +160,185 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
     the limits is not finite. A feature of the cost that is narrower than the spacing and not among the breakpoints is
     missed. The cost is evaluated ``columns`` points at a time.
     """
-    width, dim, sigma = problem.program.n_noise, problem.dim, problem.sigma
-    # E[w] = 0, so subtracting f(0) does not change the integral, and loses fewer digits
-    centre = problem.value(theta, np.zeros((width, 1)))[0]
-
-    def cost(nodes: np.ndarray) -> np.ndarray:
-        return in_columns(lambda w: problem.value(theta, w), nodes, columns)
-
-    def excess(nodes: np.ndarray) -> np.ndarray:
-        return cost(nodes) - centre
-
-    def unknown(note: str, points: int = 0, spacing: float = 0.0) -> Integral:
-        return Integral(np.full(dim, math.nan), math.nan, points, spacing, note)
-
-    low, high, beyond, note = _limits(excess, width)
-    if math.isnan(beyond):
-        return unknown(note)
-    edges, breaks = [], problem.program.breakpoints()
-    for i in range(width):
-        inner = [(b - theta[i]) / sigma for b in (breaks[i] if i < len(breaks) else ())]
-        edges.append(np.unique([low[i], *(b for b in inner if low[i] < b < high[i]), high[i]]))
-    stretch = (high - low) / (2.0 * REACH)
-    rounding = _noise(cost, width) * math.sqrt(width) / sigma
-    panels, mean, error, used, size, largest, peak = FIRST[width], None, math.inf, 0, 0.0, 0.0, np.zeros(width)
-    while True:
-        rules = _rules(edges, panels * stretch)
-        count = sum(math.prod(axis[0].size for axis in axes) for axes in rules)
-        if count > points:
-            break
-        gradients = []
-        for axes in rules:
-            nodes, weights = (
-                np.stack([part.ravel() for part in np.meshgrid(*each, indexing="ij")])
-                for each in zip(*axes, strict=True)
-            )
-            f, weights = cost(nodes), weights.prod(axis=0)
-            if not np.isfinite(f).all():
-                # samples would miss what limits wider than usual contain
-                wide = "costs far in the tails are not finite, so the mean may not exist"
-                return unknown(note or wide) if stretch.max() > 1.0 else None
-            dense = np.abs(f - centre) * np.exp(-np.square(nodes).sum(axis=0) / 2)
-            if dense.max() > largest:
-                peak, largest = nodes[:, np.argmax(dense)], float(dense.max())
-            gradients.append(nodes[:dim] @ (weights * (f - centre)) / sigma)
-            size = max(size, float(np.linalg.norm(np.abs(nodes[:dim]) @ (weights * np.abs(f))) / sigma))
-        before, mean, used = mean, np.mean(gradients, axis=0), count
-        spread = max(float(np.linalg.norm(gradient - mean)) for gradient in gradients)
-        # stated error, as a multiple of the largest distance of a rule from the mean of all rules
-        error = max(2.0 * spread, math.inf if before is None else float(np.linalg.norm(mean - before)))
-        if count >= LEAST[width] and error <= SETTLED * np.linalg.norm(mean) + rounding:
-            break
-        panels *= 2
-    if mean is None or used < LEAST[width] or not math.isfinite(error + rounding):
+    integrand, sigma = _Integrand(problem, theta, columns), problem.sigma
+    width, limits = integrand.width, _limits(integrand.excess, integrand.width)
+    if math.isnan(limits.beyond):
+        return integrand.unknown(limits.note)
+    edges = integrand.edges(limits)
+    rounding = _noise(integrand.cost, width) * math.sqrt(width) / sigma
+    try:
+        level = _refined(integrand, edges, limits.stretch, points, rounding)
+    except _NotFinite:
+        # samples would miss what limits wider than usual contain
+        wide = "costs far in the tails are not finite, so the mean may not exist"
+        return integrand.unknown(limits.note or wide) if limits.stretch.max() > 1.0 else None
+    if level is None or level.points < LEAST[width] or not math.isfinite(level.error + rounding):
         return None
-    spacing = float(np.prod(high - low)) ** (1.0 / width) / used ** (1.0 / width)
-    norm, power, missed, doubts = float(np.linalg.norm(mean)), 0.0, 0.0, [note] if note else []
-    if width > 1 or error <= SETTLED * norm + rounding:
-        missed = _missed(excess, edges) / sigma
-    is_narrow = missed > min(error, TOLERANCE * norm) + SETTLED * norm + rounding + SOLVED * size
-    if width == 1 and (is_narrow or error > TOLERANCE * norm):
-        ends = np.unique([*edges[0], *np.linspace(low[0], high[0], 2 * SEARCH[1])])
-        value, error, used, power = _bisected(lambda t: t * excess(t[None, :]) / sigma, ends)
-        mean, spacing, is_narrow = np.array([value]), float(high[0] - low[0]) / used, False
-    elif error > SETTLED * norm:
-        # along each axis, the power with which the cost grows near its largest value
-        lines = [lambda t, axis=axis: excess(peak[:, None] + np.outer(axis, t)) for axis in np.eye(width)]
+    return _integral(integrand, edges, limits, level, rounding)
+
+
+def _integral(
+    integrand: _Integrand, edges: list[np.ndarray], limits: _Limits, level: _Level, rounding: float
+) -> Integral:
+    """Return the integral of the last level, after a search for what is narrower than its panels: features, and poles."""
+    width, sigma = integrand.width, integrand.problem.sigma
+    missed = _missed(integrand.excess, edges) / sigma if width > 1 or _has_settled(level, rounding) else 0.0
+    allowed = min(level.error, TOLERANCE * level.norm) + SETTLED * level.norm + rounding + SOLVED * level.size
+    mean, error, used, power, doubts = level.mean, level.error, level.points, 0.0, [limits.note] if limits.note else []
+    if width == 1 and (missed > allowed or error > TOLERANCE * level.norm):
+        ends = np.unique([*edges[0], *np.linspace(limits.low[0], limits.high[0], 2 * SEARCH[1])])
+        value, error, used, power = _bisected(lambda t: t * integrand.excess(t[None, :]) / sigma, ends)
+        mean, missed = np.array([value]), 0.0
+    elif error > SETTLED * level.norm:
+        lines = [partial(integrand.along, level.peak, axis) for axis in np.eye(width)]
         power = max(_bisected(line, np.linspace(-1.0, 1.0, AROUND))[3] for line in lines)
-    # least power p of a pole, where the cost grows as 1 / distance^p. From p = 1 on, its integral over a line
-    # diverges
+    spacing = float(np.prod(limits.high - limits.low)) ** (1.0 / width) / used ** (1.0 / width)
+    # the integral of 1 / distance^power over a line diverges from power 1 on
     if power > 0.95:
-        place = ", ".join(f"{x:.6g}" for x in theta[:width] + sigma * peak)
-        return unknown(f"the cost is infinite near theta = ({place}), a pole, so its mean may not exist", used, spacing)
-    # the error falls as spacing^(1 - p), so a halving shows only a part of it
+        place = ", ".join(f"{x:.6g}" for x in integrand.theta[:width] + sigma * level.peak)
+        return integrand.unknown(
+            f"the cost is infinite near theta = ({place}), a pole, so its mean may not exist", used, spacing
+        )
+    # the error falls as spacing^(1 - power), so a halving shows only a part of it
     error /= 2.0 ** (1.0 - power) - 1.0
-    if is_narrow:
+    if missed > allowed:
         error += missed
         doubts.append("the cost has a feature narrower than the spacing of the points")
     if power >= 0.5:
         doubts.append(f"the cost grows as 1 / distance^{power:.2g}, so samples have no variance")
-    solved = SOLVED if problem.program.needs_root else ROUNDED * np.finfo(float).eps
-    error += beyond / sigma + rounding + solved * size
+    solved = SOLVED if integrand.problem.program.needs_root else ROUNDED * np.finfo(float).eps
+    error += limits.beyond / sigma + rounding + solved * level.size
     return Integral(mean, error, used, spacing, "; ".join(doubts))
 
 
-def _limits(excess: Callable[[np.ndarray], np.ndarray], width: int) -> tuple[np.ndarray, np.ndarray, float, str]:
-    """Return the limits of integration ``(width,)`` for ``excess (width, B) -> (B,)``, the cost minus that at 0.
+def _refined(
+    integrand: _Integrand, edges: list[np.ndarray], stretch: np.ndarray, points: int, rounding: float
+) -> _Level | None:
+    """Return the first level that has settled, or the last of at most ``points`` points; None if there is none.
 
-    Points on rays up to 38 standard deviations show where |cost| |w| times the normal density has mass, such as the
-    mean of exp(8 w), which comes from w around 8. The third value bounds the integral of the absolute integrand beyond
-    the limits. It is NaN where the integrand has not vanished at the last finite point of a ray: all limits are too
-    narrow. The fourth value is a note, or an empty string.
+    Raises :class:`_NotFinite`.
     """
+    panels, level = FIRST[integrand.width], None
+    while True:
+        rules = _rules(edges, panels * stretch)
+        if sum(math.prod(axis[0].size for axis in axes) for axes in rules) > points:
+            return level
+        finer = _level(integrand, rules)
+        level = finer if level is None else finer.after(level)
+        if level.points >= LEAST[integrand.width] and _has_settled(level, rounding):
+            return level
+        panels *= 2
+
+
+def _has_settled(level: _Level, rounding: float) -> bool:
+    return level.error <= SETTLED * level.norm + rounding
+
+
+def _level(integrand: _Integrand, rules: list[tuple[tuple[np.ndarray, np.ndarray], ...]]) -> _Level:
+    """Return the level of some rules; raises :class:`_NotFinite`."""
+    problem, gradients, points, size, densest, peak = integrand.problem, [], 0, 0.0, 0.0, np.zeros(integrand.width)
+    for axes in rules:
+        nodes, weights = (
+            np.stack([part.ravel() for part in np.meshgrid(*each, indexing="ij")]) for each in zip(*axes, strict=True)
+        )
+        f, weights = integrand.cost(nodes), weights.prod(axis=0)
+        if not np.isfinite(f).all():
+            raise _NotFinite
+        w, points = nodes[: problem.dim], points + f.size
+        gradients.append(w @ (weights * (f - integrand.centre)) / problem.sigma)
+        size = max(size, float(np.linalg.norm(np.abs(w) @ (weights * np.abs(f))) / problem.sigma))
+        dense = np.abs(f - integrand.centre) * np.exp(-np.square(nodes).sum(axis=0) / 2)
+        if dense.max() > densest:
+            densest, peak = float(dense.max()), nodes[:, np.argmax(dense)]
+    mean = np.mean(gradients, axis=0)
+    spread = max(float(np.linalg.norm(gradient - mean)) for gradient in gradients)
+    return _Level(mean, spread, points, size, densest, peak)
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """Limits of integration per axis, ``(width,)``."""
+
+    low: np.ndarray
+    high: np.ndarray
+    beyond: float
+    """Bound on the integral of |f(w) - f(0)| |w| beyond the limits; NaN where all limits are too narrow."""
+    note: str
+
+    @property
+    def stretch(self) -> np.ndarray:
+        """Distance of the limits per axis, relative to the least one, ``(width,)``."""
+        return (self.high - self.low) / (2.0 * REACH)
+
+
+@dataclass(frozen=True)
+class _Shells:
+    """The mass |f(w) - f(0)| |w| times the normal density, on rays from w = 0."""
+
+    points: np.ndarray
+    """The points ``(width, rays, radii)``."""
+    mass: np.ndarray
+    """The mass of the shell at each point, ``(rays, radii)``; 0 from a ray's first point on that is not finite."""
+    ended: np.ndarray
+    """Whether the ray has ended, ``(rays, radii)``."""
+
+    @property
+    def last(self) -> np.ndarray:
+        """Index of the last finite point of each ray, -1 where it has none, ``(rays,)``."""
+        return np.where(self.ended.any(axis=1), self.ended.argmax(axis=1) - 1, self.mass.shape[1] - 1)
+
+    def unseen(self) -> float:
+        """Return the mass beyond rays that end far out.
+
+        Shells are taken to fall at least as fast as the last two, as a geometric series; the sum is infinite or NaN
+        where these do not fall.
+        """
+        ray, last = np.arange(len(self.mass)), self.last
+        at_end, before = self.mass[ray, last.clip(0)], self.mass[ray, (last - 1).clip(0)]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = at_end / np.maximum(before, at_end)
+            rest = np.where(at_end > VANISHED * float(self.mass.sum()), at_end * ratio / (1.0 - ratio), 0.0)
+        return float(rest[SPACING * (last.clip(0) + 1) >= REACH].sum())
+
+
+def _limits(excess: Callable[[np.ndarray], np.ndarray], width: int) -> _Limits:
+    """Return the limits of integration for ``excess (width, B) -> (B,)``, the cost minus that at 0.
+
+    Points on rays up to 38 standard deviations show where the integrand has mass, such as the mean of exp(8 w), which
+    comes from w around 8. All limits are too narrow where the integrand has not vanished at a ray's last finite point.
+    """
+    shells = _shells(excess, width)
+    points, mass, total = shells.points, shells.mass, float(shells.mass.sum())
+    low, high = np.full(width, -REACH), np.full(width, REACH)
+    beyond = float(mass[np.abs(points).max(axis=0) > REACH].sum())
+    if beyond > NEGLIGIBLE * total:
+        # what each point and all points farther out on its ray contribute
+        rest = np.cumsum(mass[:, ::-1], axis=1)[:, ::-1]
+        inside, finite = points[:, rest > NEGLIGIBLE * total / len(mass)], points[:, ~shells.ended]
+        low = np.maximum(np.minimum(low, inside.min(axis=1) - MARGIN), finite.min(axis=1))
+        high = np.minimum(np.maximum(high, inside.max(axis=1) + MARGIN), finite.max(axis=1))
+        is_outside = (points < low[:, None, None]) | (points > high[:, None, None])
+        beyond = float(mass[is_outside.any(axis=0)].sum())
+    unseen, nearest, note = shells.unseen(), SPACING * (shells.last.min() + 1), ""
+    if shells.ended.any() and nearest >= REACH:
+        note = f"costs beyond {nearest:g} standard deviations are not finite, so the mean may not exist"
+    # share of the mass beyond the last finite points above which the integral may not exist
+    if unseen > 1e-3 * total:
+        return _Limits(
+            low, high, math.nan, note or "the cost grows as fast as the normal density falls, so its mean may not exist"
+        )
+    return _Limits(low, high, 2.0 * (beyond + unseen), note)
+
+
+def _shells(excess: Callable[[np.ndarray], np.ndarray], width: int) -> _Shells:
+    """Return the mass on rays, as far out as it has vanished."""
     turn = 2.0 * math.pi * (np.arange(RAYS) + 0.5) / RAYS
     rays = np.array([[-1.0, 1.0]]) if width == 1 else np.stack([np.cos(turn), np.sin(turn)])
     for farthest in (NEAR, FARTHEST):
         radii = SPACING * np.arange(1, round(farthest / SPACING) + 1)
-        points = (rays[:, :, None] * radii).reshape(width, -1)
+        points = rays[:, :, None] * radii
         with np.errstate(all="ignore"):
-            f = np.abs(excess(points)).reshape(rays.shape[1], radii.size)
+            f = np.abs(excess(points.reshape(width, -1))).reshape(points.shape[1:])
             # per ray, the share of each shell: the area of its sector times the normal density
             shell = SPACING * radii ** (width - 1) * np.exp(-(radii**2) / 2) / math.sqrt(2.0 * math.pi) ** width
             mass = f * radii * shell * (2.0 * math.pi / RAYS if width == 2 else 1.0)
@@ -182,36 +346,7 @@ def _limits(excess: Callable[[np.ndarray], np.ndarray], width: int) -> tuple[np.
             break
     # a ray ends at its first point that is not finite
     ended = np.logical_or.accumulate(~np.isfinite(mass), axis=1)
-    mass = np.where(ended, 0.0, mass)
-    total = float(mass.sum())
-    low, high = np.full(width, -REACH), np.full(width, REACH)
-    outside = np.abs(points).max(axis=0).reshape(mass.shape) > REACH
-    beyond = float(mass[outside].sum())
-    if beyond > NEGLIGIBLE * total:
-        # what each point and all points farther out on its ray contribute
-        rest = np.cumsum(mass[:, ::-1], axis=1)[:, ::-1]
-        inside = points[:, (rest > NEGLIGIBLE * total / rays.shape[1]).ravel()]
-        finite = points[:, ~ended.ravel()]
-        low = np.maximum(np.minimum(low, inside.min(axis=1) - MARGIN), finite.min(axis=1))
-        high = np.minimum(np.maximum(high, inside.max(axis=1) + MARGIN), finite.max(axis=1))
-        outside = ((points < low[:, None]) | (points > high[:, None])).any(axis=0).reshape(mass.shape)
-        beyond = float(mass[outside].sum())
-    note = ""
-    last = np.where(ended.any(axis=1), ended.argmax(axis=1) - 1, radii.size - 1)
-    ray = np.arange(last.size)
-    at_end, before = mass[ray, last.clip(0)], mass[ray, (last - 1).clip(0)]
-    # beyond the last finite point, shells fall at least as fast as the last two, as a geometric series
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = at_end / np.maximum(before, at_end)
-        unseen = np.where(at_end > VANISHED * total, at_end * ratio / (1.0 - ratio), 0.0)[radii[last.clip(0)] >= REACH]
-    if ended.any() and radii[last.min()] >= REACH:
-        note = f"costs beyond {radii[last.min()]:g} standard deviations are not finite, so the mean may not exist"
-    # share of the integral of absolute values at the last finite point of a ray above which the integral may
-    # not exist
-    if float(unseen.sum()) > 1e-3 * total:
-        note = note or "the cost grows as fast as the normal density falls, so its mean may not exist"
-        return low, high, math.nan, note
-    return low, high, 2.0 * (beyond + float(unseen.sum())), note
+    return _Shells(points, np.where(ended, 0.0, mass), ended)
 
 
 def _missed(excess: Callable[[np.ndarray], np.ndarray], edges: list[np.ndarray]) -> float:
