@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bench.plugins.studies.train.verdicts import MEANINGS, judge
+from bench.plugins.studies.train.verdicts import RULES, judge
 
 from bench.model.trainer import LOGGED
 
@@ -75,7 +75,7 @@ def test_a_planted_fault_is_the_only_one_named(name):
 
 
 def test_every_fault_is_planted():
-    assert {code for _, code, _ in PLANTED.values()} == set(MEANINGS)
+    assert {code for _, code, _ in PLANTED.values()} == set(RULES)
 
 
 HARMLESS = {

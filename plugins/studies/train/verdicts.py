@@ -12,93 +12,15 @@ from bench.model.trainer import LOGGED
 
 from .. import mean_interval
 
-FACTOR = 100.0
-"""Factor between the gradients of the first ten updates and of the last tenth of a run, above which it grows or vanishes."""
-PEAK, USUAL = 200.0, 0.9
-"""Factor on a run's usual gradient, this quantile of all, above which one explodes; clipping absorbs smaller peaks."""
-FIRST = 10
-"""Updates at the start whose smallest gradient is compared with the last tenth of a run."""
-SILENT = 0.2
-"""Share of updates with a gradient of exactly 0 that is a fault: less may come from saturated actions."""
-LOST = 0.5
-"""Share of the rise of a return whose loss by the end is a fault."""
-DOUBLED = 2.0
-"""Factor on the largest penetration that counts as an exploited contact."""
-GROWN = 10.0
-"""Factor on the first largest parameter above which a policy's parameters are unphysical."""
-DEVIATIONS = (1e-3, 1e2)
-"""Range of plausible standard deviations of actions, whose scale is about 1."""
 DISAGREES = 0.1
 """Relative error of an applied gradient's slope above which it disagrees with central differences."""
-MIN_CHECKS = 3
-"""Fewest comparisons of gradients for an interval of their cosine."""
 FINITE = ("reward", "loss", "gradient_norm", "parameter_largest")
 """Quantities whose entries have to be finite."""
-MEANINGS = {
-    "not_finite": "a loss, gradient or parameter is not finite",
-    "zero": "share of updates with a gradient of exactly 0",
-    "explodes": "largest gradient, relative to that which nine of ten updates stay below",
-    "grows": "gradient of the last tenth, relative to the smallest of the first ten updates",
-    "vanishes": "gradient of the last tenth, relative to the first tenth, while the return rises no more",
-    "differences": "largest relative error of the applied gradient's slope, along a random direction in an array of the policy",
-    "opposed": "cosine between first- and zeroth-order gradients, certainly below 0",
-    "falls": "return lost since its best evaluation, more than half of the rise before",
-    "soft_contact": "factor on the penetration while the reward rises: the policy uses the soft contact",
-    "parameters": "largest parameter of the policy, relative to its first value",
-    "deviation": "standard deviation of the actions, which is unphysical",
-}
-"""What the value of each fault is."""
 
 Verdict = dict[str, Any]
 """A fault: its ``code``, the ``value`` that shows it, and the ``update`` where it starts if it has one."""
-
-
-@np.errstate(all="ignore")
-def judge(run: Mapping[str, Any]) -> list[Verdict]:
-    """Return the faults that a stored run shows, in the order of :data:`MEANINGS`; empty for a healthy run.
-
-    What noise can explain does not count: means are compared by a test, and evaluations need their intervals apart.
-    """
-    log = {name: series(run[f"log_{name}"]) for name in ("update", *LOGGED)}
-    bad = [log["update"][at] for name in FINITE for at in np.flatnonzero(~np.isfinite(log[name]))[:1]]
-    # what a trainer does not log is NaN, which is no fault
-    nothing = np.full(max(log["update"].size, 1), math.nan)
-    known = {name: values if values.size else nothing for name, values in log.items()}
-    updates, norms, largest = known["update"], known["gradient_norm"], known["parameter_largest"]
-    reward, depth, deviation = known["reward"], known["penetration"], known["deviation"]
-    tenth = max(len(updates) // 10, 1)
-    early, late, usual = np.median(norms[:tenth]), np.median(norms[-tenth:]), np.quantile(norms, USUAL)
-    first = norms[: max((updates <= FIRST).sum(), 1)].min()
-    silent = run["gradient_zero"] if math.isfinite(run["gradient_zero"]) else (norms == 0).mean()
-    small = updates[norms >= early / FACTOR].max(initial=0.0)
-    has_vanished = 0 < late < early / FACTOR and small < updates[-tenth:][0] and not _rises(run, small)
-    error, cosines = _known(run["slope_errors"]).max(initial=0.0), _known(run["cosine"])
-    mean, low, high = (np.asarray(run[f"curve_return{end}"], dtype=float) for end in ("", "_low", "_high"))
-    best = np.argmax(np.nan_to_num(mean, nan=-math.inf))
-    lost = mean[best] - mean[-1]
-    outside = np.flatnonzero((deviation < DEVIATIONS[0]) | (deviation > DEVIATIONS[1]))
-    deeper = depth[-tenth:].mean() / depth[:tenth].mean()
-    is_used = tenth > 1 and DOUBLED < deeper < math.inf and all(
-        _is_below(values[:tenth], values[-tenth:]) for values in (reward, depth)
-    )  # fmt: skip
-    faults = {
-        "not_finite": (bad, math.nan, bad[-1:]),
-        "zero": (np.isfinite(norms).all() and silent > SILENT, silent, updates[[norms.argmin()]]),
-        "explodes": (math.inf > norms.max() > PEAK * usual > 0, norms.max() / usual, updates[[norms.argmax()]]),
-        "grows": (late > FACTOR * first > 0, late / first, updates[norms > FACTOR * first]),
-        "vanishes": (has_vanished, late / early, [small]),
-        "differences": (error > DISAGREES, error, []),
-        "opposed": (len(cosines) >= MIN_CHECKS and mean_interval(cosines)[2] < 0, cosines.sum() / len(cosines), []),
-        # the last return is far below the best one, whatever the loss does
-        "falls": (high[-1] < low[best] and lost > LOST * (mean[best] - mean[0]), lost, [run["curve_update"][best]]),
-        "soft_contact": (is_used, deeper, []),
-        "parameters": (largest.max() > GROWN * largest[0], largest.max() / largest[0], updates[largest > GROWN * largest[0]]),
-        "deviation": (outside.size, deviation[outside[:1]].sum(), updates[outside]),
-    }  # fmt: skip
-    return [
-        {"code": code, "value": float(value)} | ({"update": int(where[0])} if len(where) else {})
-        for code, (is_fault, value, where) in faults.items() if is_fault
-    ]  # fmt: skip
+Found = tuple[Any, Any] | None
+"""The value that shows a fault, and the updates that show it, which may be empty; None: no fault."""
 
 
 def series(values: Any) -> np.ndarray:
@@ -112,14 +34,150 @@ def _known(values: Any) -> np.ndarray:
     return numbers[~np.isnan(numbers)]
 
 
-def _rises(run: Mapping[str, Any], since: float) -> bool:
-    """Return whether the last return is certainly above that of the last evaluation up to an update."""
-    at = max(int((np.asarray(run["curve_update"], dtype=float) <= since).sum()) - 1, 0)
-    return bool(run["curve_return_low"][-1] > run["curve_return_high"][at])
+class _Training:
+    """A stored run: each logged quantity as a series, NaN where the trainer logs nothing, which is no fault."""
+
+    def __init__(self, run: Mapping[str, Any]) -> None:
+        self.run = run
+        self.logged = {name: series(run[f"log_{name}"]) for name in ("update", *LOGGED)}
+        nothing = np.full(max(self.logged["update"].size, 1), math.nan)
+        known = {name: values if values.size else nothing for name, values in self.logged.items()}
+        self.updates, self.norms, self.largest = known["update"], known["gradient_norm"], known["parameter_largest"]
+        self.reward, self.depth, self.deviation = known["reward"], known["penetration"], known["deviation"]
+        self.tenth = max(len(self.updates) // 10, 1)
+        self.late = np.median(self.norms[-self.tenth :])
+
+    def curve(self, end: str = "") -> np.ndarray:
+        """Return the returns of the evaluations, or an end of their intervals."""
+        return np.asarray(self.run[f"curve_return{end}"], dtype=float)
+
+    def rises(self, since: float) -> bool:
+        """Return whether the last return is certainly above that of the last evaluation up to an update."""
+        at = max(int((np.asarray(self.run["curve_update"], dtype=float) <= since).sum()) - 1, 0)
+        return bool(self.curve("_low")[-1] > self.curve("_high")[at])
+
+    def is_lower_first(self, values: np.ndarray) -> bool:
+        """Return whether the mean of the first tenth is certainly below that of the last, by Welch's test at 5% (two sides)."""
+        from scipy.stats import ttest_ind
+
+        ends = values[: self.tenth], values[-self.tenth :]
+        return bool(ttest_ind(*ends, equal_var=False, alternative="less").pvalue < 0.025)
 
 
-def _is_below(a: np.ndarray, b: np.ndarray) -> bool:
-    """Return whether the mean of ``a`` is certainly below that of ``b``, by Welch's test at 5% (two sides)."""
-    from scipy.stats import ttest_ind
+def _not_finite(training: _Training) -> Found:
+    logged = training.logged
+    bad = [logged["update"][at] for name in FINITE for at in np.flatnonzero(~np.isfinite(logged[name]))[:1]]
+    return (math.nan, bad[-1:]) if bad else None
 
-    return bool(ttest_ind(a, b, equal_var=False, alternative="less").pvalue < 0.025)
+
+def _zero(training: _Training) -> Found:
+    norms, stated = training.norms, training.run["gradient_zero"]
+    silent = stated if math.isfinite(stated) else (norms == 0).mean()
+    # fewer may come from saturated actions
+    return (silent, training.updates[[norms.argmin()]]) if np.isfinite(norms).all() and silent > 0.2 else None
+
+
+def _explodes(training: _Training) -> Found:
+    peak, usual = training.norms.max(), np.quantile(training.norms, 0.9)
+    # clipping absorbs smaller peaks
+    return (peak / usual, training.updates[[training.norms.argmax()]]) if math.inf > peak > 200.0 * usual > 0 else None
+
+
+def _grows(training: _Training) -> Found:
+    norms, late = training.norms, training.late
+    first = norms[: max((training.updates <= 10).sum(), 1)].min()
+    return (late / first, training.updates[norms > FACTOR * first]) if late > FACTOR * first > 0 else None
+
+
+def _vanishes(training: _Training) -> Found:
+    early, late, updates = np.median(training.norms[: training.tenth]), training.late, training.updates
+    if not 0 < late < early / FACTOR:
+        return None
+    since = updates[training.norms >= early / FACTOR].max(initial=0.0)
+    return (late / early, [since]) if since < updates[-training.tenth :][0] and not training.rises(since) else None
+
+
+def _differences(training: _Training) -> Found:
+    error = _known(training.run["slope_errors"]).max(initial=0.0)
+    return (error, []) if error > DISAGREES else None
+
+
+def _opposed(training: _Training) -> Found:
+    cosines = _known(training.run["cosine"])
+    # an interval of the cosine needs three comparisons
+    is_opposed = len(cosines) >= 3 and mean_interval(cosines)[2] < 0
+    return (cosines.sum() / len(cosines), []) if is_opposed else None
+
+
+def _falls(training: _Training) -> Found:
+    # the last return is far below the best one, whatever the loss does
+    mean, low, high = (training.curve(end) for end in ("", "_low", "_high"))
+    best = np.argmax(np.nan_to_num(mean, nan=-math.inf))
+    lost = mean[best] - mean[-1]
+    has_fallen = high[-1] < low[best] and lost > 0.5 * (mean[best] - mean[0])
+    return (lost, [training.run["curve_update"][best]]) if has_fallen else None
+
+
+def _soft_contact(training: _Training) -> Found:
+    tenth, depth = training.tenth, training.depth
+    deeper = depth[-tenth:].mean() / depth[:tenth].mean()
+    is_deeper = tenth > 1 and 2.0 < deeper < math.inf
+    return (
+        (deeper, [])
+        if is_deeper and training.is_lower_first(training.reward) and training.is_lower_first(depth)
+        else None
+    )
+
+
+def _parameters(training: _Training) -> Found:
+    largest, most = training.largest, 10.0 * training.largest[0]
+    return (largest.max() / largest[0], training.updates[largest > most]) if largest.max() > most else None
+
+
+def _deviation(training: _Training) -> Found:
+    # the scale of actions is about 1
+    outside = np.flatnonzero((training.deviation < 1e-3) | (training.deviation > 1e2))
+    return (training.deviation[outside[0]], training.updates[outside]) if outside.size else None
+
+
+FACTOR = 100.0
+"""Factor between the gradients at the start and in the last tenth of a run above which they grow or vanish."""
+RULES = {
+    "not_finite": (_not_finite, "a loss, gradient or parameter is not finite"),
+    "zero": (_zero, "share of updates with a gradient of exactly 0"),
+    "explodes": (_explodes, "largest gradient, relative to that which nine of ten updates stay below"),
+    "grows": (_grows, "gradient of the last tenth, relative to the smallest of the first ten updates"),
+    "vanishes": (
+        _vanishes,
+        "gradient of the last tenth, relative to the first tenth, while the return rises no more",
+    ),
+    "differences": (
+        _differences,
+        "largest relative error of the applied gradient's slope, along a random direction in an array of the policy",
+    ),
+    "opposed": (_opposed, "cosine between first- and zeroth-order gradients, certainly below 0"),
+    "falls": (_falls, "return lost since its best evaluation, more than half of the rise before"),
+    "soft_contact": (
+        _soft_contact,
+        "factor on the penetration while the reward rises: the policy uses the soft contact",
+    ),
+    "parameters": (_parameters, "largest parameter of the policy, relative to its first value"),
+    "deviation": (_deviation, "standard deviation of the actions, which is unphysical"),
+}
+"""By code: the function that recognises the fault, and what its value is."""
+
+
+@np.errstate(all="ignore")
+def judge(run: Mapping[str, Any]) -> list[Verdict]:
+    """Return the faults that a stored run shows, in the order of :data:`RULES`; empty for a healthy run.
+
+    What noise can explain does not count: means are compared by a test, and evaluations need their intervals apart.
+    """
+    training, verdicts = _Training(run), []
+    for code, (fault, _) in RULES.items():
+        if found := fault(training):
+            value, updates = found
+            verdicts.append(
+                {"code": code, "value": float(value)} | ({"update": int(updates[0])} if len(updates) else {})
+            )
+    return verdicts

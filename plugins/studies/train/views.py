@@ -21,7 +21,7 @@ from bench.report.problems import problem_names
 from bench.report.views import arrange, attempted
 
 from .. import PARTS
-from .verdicts import MEANINGS, judge, series
+from .verdicts import RULES, judge, series
 
 LEVEL = 0.05
 """Level of the test of a difference between two groups of runs."""
@@ -276,7 +276,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
         tables.append(Table("windows", lines, WINDOWS, "Windows", [WINDOW_NOTE, WINDOW_VERDICTS], terminal=True, page=True,
                             details=["gradient_typical"]))  # fmt: skip
     if len(faults):
-        notes = [FAULT_NOTE, *(f"- {code}: {MEANINGS[code]}" for code in faults["code"].unique())]
+        notes = [FAULT_NOTE, *(f"- {code}: {RULES[code][1]}" for code in faults["code"].unique())]
         tables.append(Table("faults", faults, FAULTS, "Faults in the logs", notes, page=True))
     cells = rows.assign(problem=runs["problem"], method=runs["method"]).fillna({"problem": "", "method": ""})
     by_name = experiment.columns.by_name
