@@ -8,13 +8,11 @@ forward pass stores the carries that the backward pass reads. The backward pass 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Iterable
 
 import numpy as np
 
-from .adjoint import active, pullback
+from .backward import LOOKUPS, TIMED, Backward, backward, closure, dependent
 from .functions import helpers
 from .graph import Node, reached
 from .trace import Loop
@@ -41,10 +39,7 @@ def kernel(parameter, constant, index, horizon, theta, theta_row, theta_column, 
     """Fill columns start to stop of ``out``; return whether all angles were small enough for fast sine and cosine, and
     whether all slopes are below ``BEYOND``."""
 '''
-LOOKUPS = {"theta@", "scored@", "noise@"}
 LANE = f"for l in range({LANES}):"
-TIMED = LOOKUPS | {"table", "carry", "adjoint"}
-"""Leaves that differ between steps."""
 WIDE = LOOKUPS | {"theta", "scored", "noise", "carry", "final", "adjoint", "total", "before"}
 """Leaves that differ between lanes."""
 
@@ -66,44 +61,6 @@ def _block(head: str, lines: list[str]) -> list[str]:
     return [head, *(f"    {line}" for line in lines)] if lines else []
 
 
-def _dependent(nodes: list[Node], leaves: set[str]) -> set[int]:
-    """Return the numbers of the nodes that depend on leaves of these kinds. ``nodes`` is ordered, arguments first."""
-    found: set[int] = set()
-    for node in nodes:
-        if node.op in leaves or any(arg.number in found for arg in node.args):
-            found.add(node.number)
-    return found
-
-
-def _closure(found: set[Any], more: Callable[[set[Any]], set[Any]]) -> set[Any]:
-    """Return a set after all that ``more`` finds from it has been added."""
-    while not (new := more(found)) <= found:
-        found = found | new
-    return found
-
-
-@dataclass
-class _Backward:
-    """The expressions of a backward pass; without any for the function itself."""
-
-    seeds: dict[int, Node] = field(default_factory=dict)
-    """Cotangents of the carries after the last step."""
-    step: dict[int, Node] = field(default_factory=dict)
-    """Cotangents of the carries before a step."""
-    totals: dict[int, Node] = field(default_factory=dict)
-    """Contribution of each step to the cotangent of a value from before the loop, by the number of its node."""
-    tables: dict[int, Node] = field(default_factory=dict)
-    """Contribution of each step to the result, at the step's index in the table."""
-    ends: dict[int, Node] = field(default_factory=dict)
-    """Contribution to each entry of the result after the loop."""
-    history: list[int] = field(default_factory=list)
-    """Numbers of the carries that the backward pass reads."""
-
-    def inside(self) -> list[Node]:
-        """Return the expressions that are computed in each step."""
-        return [*self.step.values(), *self.totals.values(), *self.tables.values()]
-
-
 class _Kernel:
     """Generates the body of a kernel: blocks of lines, from the inner loops outwards."""
 
@@ -112,18 +69,18 @@ class _Kernel:
         assert loop.result is not None
         self.result = loop.result
         kept = self._needed([loop.result]) if loop.length else []
-        self.back = back = _Backward()
+        self.back = back = Backward()
         after = [loop.result]
         if wrt:
-            self.back = back = self._backward(kept, wrt)
+            self.back = back = backward(loop, kept, wrt)
             after = [*back.seeds.values(), *back.ends.values()]
             # the derivative may need fewer carries: for example, it does not read the accumulated cost
             kept = self._needed([*after, *(loop.step[i] for i in back.history)], back.history)
         self.forward, self.starts = ({i: part[i] for i in kept} for part in (loop.step, loop.first))
         inside = [*self.forward.values(), *back.inside()]
         self.nodes = reached([*self.starts.values(), *inside, *after])
-        self.wide, self.timed = (_dependent(self.nodes, leaves) for leaves in (WIDE, TIMED))
-        late = self.timed | _dependent(self.nodes, {"final", "before", "total"})
+        self.wide, self.timed = (dependent(self.nodes, leaves) for leaves in (WIDE, TIMED))
+        late = self.timed | dependent(self.nodes, {"final", "before", "total"})
         early = {n.number: n for n in self.nodes if n.number in self.wide - late}
         users = [n for n in reached([*inside, *after]) if n.number not in early]
         read = {arg.number for n in users for arg in n.args} | {n.number for n in [*inside, *after]}
@@ -147,65 +104,7 @@ class _Kernel:
         def more(found: set[int]) -> set[int]:
             return {node.data for node in reached([self.loop.step[i] for i in found]) if node.op == "carry"}
 
-        return sorted(_closure({node.data for node in reached(roots) if node.op == "final"} | set(carries), more))
-
-    # ------------------------------------------------------------------------------------------- the adjoint
-
-    def _backward(self, kept: list[int], wrt: str) -> _Backward:
-        """Return the expressions of the backward pass through the carries ``kept``."""
-        loop, graph, own = self.loop, self.graph, (wrt, f"{wrt}@")
-
-        def moving_in(live: set[int]) -> set[int]:
-            """Return the carries whose value after a step depends on ``wrt`` or on live carries."""
-            ends = {i: loop.step[i] for i in kept}
-            return {i for i, end in ends.items() if end.number in active(reached([end]), of_live(live))}
-
-        def of_live(live: set[int]) -> Callable[[Node], bool]:
-            return lambda node: node.op in own or (node.op == "carry" and node.data in live)
-
-        starting = {i for i in kept if active(reached([loop.first[i]]), lambda node: node.op == wrt)}
-        live = _closure(starting, moving_in)
-        found = pullback(
-            graph,
-            [(self.result, graph.literal(1.0))],
-            lambda n: n.op == wrt or (n.op == "final" and n.data in live),
-        )
-        seeds = {node.data: ct for node, ct in found.items() if node.op == "final"}
-        direct = {node.data: ct for node, ct in found.items() if node.op == wrt}
-        # values from before the loop whose cotangents are summed over the steps
-        whole = reached([loop.step[i] for i in kept])
-        outer = active(whole, of_live(live)) - _dependent(whole, TIMED)
-        boundary = {arg.number for n in whole if n.number not in outer for arg in n.args} | {
-            loop.step[i].number for i in kept
-        }
-        boundary &= outer
-
-        def wanted(node: Node) -> bool:
-            return node.number in boundary or node.op == own[1] or (node.op == "carry" and node.data in live)
-
-        # a cotangent that a step does not change, such as the accumulated cost's, is constant over the loop
-        moving = {i for i, ct in seeds.items() if ct.value is None}
-        while True:
-            adjoints = {i: graph.leaf("adjoint", i) if i in moving else seeds[i] for i in sorted({*seeds, *moving})}
-            found = pullback(graph, [(loop.step[i], ct) for i, ct in adjoints.items()], wanted)
-            step = {node.data: ct for node, ct in found.items() if node.op == "carry"}
-            changed = {i for i in {*seeds, *step} - moving if step.get(i) is not seeds.get(i)}
-            if not changed:
-                break
-            moving |= changed
-        zero = graph.literal(0.0)
-        step = {i: step.get(i, zero) for i in sorted(moving)}
-        totals = {node.number: ct for node, ct in found.items() if node.number in boundary}
-        tables = {node.data: ct for node, ct in found.items() if node.op == own[1]}
-        first = [(loop.first[i], ct) for i, ct in seeds.items() if i not in moving]
-        first += [(loop.first[i], graph.leaf("before", i)) for i in step]
-        first += [(graph.nodes[i], graph.leaf("total", i)) for i in totals]
-        ends = {node.data: ct for node, ct in pullback(graph, first, lambda node: node.op == wrt).items()}
-        for i, ct in direct.items():
-            ends[i] = graph.apply("add", ends[i], ct) if i in ends else ct
-        used = reached([*step.values(), *totals.values(), *tables.values()])
-        history = sorted({node.data for node in used if node.op == "carry"})
-        return _Backward({i: seeds.get(i, zero) for i in step}, step, totals, tables, ends, history)
+        return sorted(closure({node.data for node in reached(roots) if node.op == "final"} | set(carries), more))
 
     # --------------------------------------------------------------------------------------------- the loops
 
