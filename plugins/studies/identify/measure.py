@@ -431,63 +431,106 @@ class Fit:
         return own - later @ (np.linalg.pinv(later) @ own)
 
 
+@dataclass(frozen=True)
+class _Intervals:
+    """Estimates of the invariants from the first record and their 95% intervals, each ``(rank,)``."""
+
+    estimate: np.ndarray
+    size: np.ndarray
+    """The error of an estimate per error of its coordinate."""
+    half: np.ndarray
+    """Half the widths of the intervals of the coordinates."""
+    low: np.ndarray
+    high: np.ndarray
+    noise: str
+    """The noise that the intervals allow for."""
+
+
+def _intervals(fit: Fit, known: Information, theta: np.ndarray) -> _Intervals:
+    """Return the intervals for estimates ``theta (p,)`` of the parameters."""
+    scale, invariants = fit.fitting.model.scale, known.invariants
+    estimate, (half, kind) = _products(theta, invariants), _half_widths(fit, 0, known)
+    size = np.abs(_products(np.where(scale, scale, theta), invariants))
+    # an unknown without a logarithm has an interval of its own values
+    is_linear = np.abs(invariants) @ (scale != 0.0) > SHARE
+    with np.errstate(over="ignore", invalid="ignore"):
+        low, high = (
+            np.where(is_linear, estimate + side * size * half, estimate * np.exp(side * half)) for side in (-1.0, 1.0)
+        )
+    return _Intervals(estimate, size, half, low, high, kind)
+
+
+def _units(model: Model, names: tuple[str, ...]) -> dict[str, str]:
+    """Return the units of unknowns; empty for entries of the initial state."""
+    parts = [*map(type, model.program.parts.values())]
+    return {name: (part.unit or "1") if (part := named(parts, name)) else "" for name in names}
+
+
 def _estimates(fit: Fit, known: Information, start: np.ndarray, own: Mapping[str, str]) -> dict[str, Any]:
     """Return the first record's estimates, whether fits explain the records, and the biases that tests can miss.
 
     ``explained`` is the share of records that no test contradicts. The other columns belong to the first record.
     """
-    model, invariants, residual, sigma = fit.fitting.model, known.invariants, fit.residual, fit.fitting.noise
-    p, rank = len(known.names), known.rank
+    model, invariants, p, rank = fit.fitting.model, known.invariants, len(known.names), known.rank
     theta = model.theta(fit.solution[:p, :1])[:, 0]
+    # the invariants, then the parameters that are none
     names = list(dict.fromkeys([*known.labels, *known.names]))
     exponents = np.concatenate([invariants, np.eye(p)[[known.names.index(name) for name in names[rank:]]]])
     is_seen = (np.abs(exponents @ invariants.T) > SHARE).any(axis=1)
-    parts = [*map(type, model.program.parts.values())]
-    own_units = {name: (part.unit or "1") if (part := named(parts, name)) else "" for name in known.names}
-    units = tuple(f"({unit})" if {*unit} & {*" /"} else unit or "1" for unit in own_units.values())
-    # an unknown without a logarithm has an interval of its own values
-    estimate, half, noise_kind = _products(theta, invariants), *_half_widths(fit, 0, known)
-    size = np.abs(_products(np.where(model.scale, model.scale, theta), invariants))
-    is_linear = np.abs(invariants) @ (model.scale != 0.0) > SHARE
-    with np.errstate(over="ignore", invalid="ignore"):
-        low, high = (
-            np.where(is_linear, estimate + side * size * half, estimate * np.exp(side * half)) for side in (-1.0, 1.0)
-        )
-    nothing = [math.nan] * (len(names) - rank)
-    result: dict[str, Any] = {
-        "parameter": names, "estimate": [*estimate, *nothing], "estimate_low": [*low, *nothing],
-        "estimate_high": [*high, *nothing], "unit": [
-            own_units.get(name, product(units, row)) for name, row in zip(names, exponents, strict=True)
-        ],
-        "start": _products(start, exponents).tolist(), "interval_noise": noise_kind,
+    units = _units(model, known.names)
+    factors = tuple(f"({unit})" if {*unit} & {*" /"} else unit or "1" for unit in units.values())
+    intervals, nothing = _intervals(fit, known, theta), [math.nan] * (len(names) - rank)
+    result = {
+        "parameter": names,
+        "estimate": [*intervals.estimate, *nothing],
+        "estimate_low": [*intervals.low, *nothing],
+        "estimate_high": [*intervals.high, *nothing],
+        "unit": [units.get(name, product(factors, row)) for name, row in zip(names, exponents, strict=True)],
+        "start": _products(start, exponents).tolist(),
+        "interval_noise": intervals.noise,
         "identifiable": ["yes" if k < rank else "product" if seen else "no" for k, seen in enumerate(is_seen)],
-        "bias": [math.nan] * len(names), "biased": [], "term": [], "unnoticed": [], "errors": [],
-    }  # fmt: skip
+        "bias": [math.nan] * len(names),
+        "biased": [],
+        "term": [],
+        "unnoticed": [],
+        "errors": [],
+    }
     finite = np.flatnonzero(fit.is_finite)[:TESTED].tolist()
     if not finite or finite[0]:
         return result
     # the effects of missing terms at one fit serve all records, which have the same truth
-    terms = missing_terms(model, theta, sigma, own)
+    terms = missing_terms(model, theta, fit.fitting.noise, own)
     verdicts = [
-        adequacy.judge(residual[:, i], known.along(fit.slopes(i)), len(model.measured), terms, i, fit.is_noise_known)
+        adequacy.judge(
+            fit.residual[:, i], known.along(fit.slopes(i)), len(model.measured), terms, i, fit.is_noise_known
+        )
         for i in finite
     ]
-    first, free = verdicts[0], max(len(residual) - rank, 1)
-    effects = np.array([terms[name] for name in first.reach]).reshape(-1, len(residual))
-    shares = np.abs(np.linalg.pinv(known.along(fit.slopes(0))) @ effects.T) / known.bound[:, None]
-    with np.errstate(invalid="ignore"):  # an effect that is all in one estimate moves no other
-        biases = known.bound[:, None] * np.where(
-            shares > adequacy.RESOLVED * shares.max(axis=0, initial=0.0), shares * [*first.reach.values()], 0.0
-        )
-    unnoticed = biases * size[:, None]
-    return result | {
+    first = verdicts[0]
+    result |= {
         "explained": float(np.mean([one.is_explained for one in verdicts])) + 0.0 * first.probability,  # nan: untested
         "contradictions": ", ".join(f"{name} ({value:.2g})" for name, value in first.contradictions.items()),
-        "noise_size": sigma * norm(residual[:, 0]) / math.sqrt(free),
-        "bias": [*unnoticed.max(axis=1, initial=0.0), *nothing] if effects.size else result["bias"],
-        "biased": np.repeat(known.labels, len(effects)).tolist(), "term": [*first.reach] * rank,
-        "unnoticed": unnoticed.ravel().tolist(), "errors": (biases * performance.Z / half[:, None]).ravel().tolist(),
-    }  # fmt: skip
+        "noise_size": fit.fitting.noise * norm(fit.residual[:, 0]) / math.sqrt(max(len(fit.residual) - rank, 1)),
+    }
+    if not first.reach:
+        return result
+    biases = _hidden_biases(fit, known, np.array([terms[name] for name in first.reach]), [*first.reach.values()])
+    unnoticed = biases * intervals.size[:, None]
+    return result | {
+        "bias": [*unnoticed.max(axis=1, initial=0.0), *nothing],
+        "biased": np.repeat(known.labels, len(first.reach)).tolist(),
+        "term": [*first.reach] * rank,
+        "unnoticed": unnoticed.ravel().tolist(),
+        "errors": (biases * performance.Z / intervals.half[:, None]).ravel().tolist(),
+    }
+
+
+def _hidden_biases(fit: Fit, known: Information, effects: np.ndarray, reach: list[float]) -> np.ndarray:
+    """Return the change of the invariants' coordinates ``(rank, k)`` by ``effects (k, m)`` of a size that tests just miss."""
+    shares = np.abs(np.linalg.pinv(known.along(fit.slopes(0))) @ effects.T) / known.bound[:, None]
+    is_moved = shares > adequacy.RESOLVED * shares.max(axis=0, initial=0.0)
+    with np.errstate(invalid="ignore"):  # an effect that is all in one estimate moves no other
+        return known.bound[:, None] * np.where(is_moved, shares * reach, 0.0)
 
 
 def _half_widths(fit: Fit, i: int, known: Information) -> tuple[np.ndarray, str]:
@@ -515,8 +558,44 @@ TERMS = {
 
 x is what they act on, q and v are the coordinate that they accelerate, q0, v0, ... the state, and t rises from -1 to 1.
 """
-RELATIVE = 1e-4
-"""Size of a missing effect when it is computed, relative to the largest value of what it acts on."""
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where an effect may act: a kind of :data:`TERMS`, what it acts on, and the course and the size of that."""
+
+    kind: str
+    of: str
+    signal: np.ndarray
+    size: float
+
+
+def _places(model: Model, path: np.ndarray, controls: np.ndarray) -> list[_Place]:
+    """Return the places along a motion: entries of the start, accelerations, controls and sensors."""
+    scene, entries = model.program.scene, model.entries
+    speeds, inputs = path[:, scene.n_q :], np.pad(controls, ((0, 1), (0, 0)), "edge")
+    acceleration = np.abs(np.diff(speeds, axis=0)).max() / scene.dt
+
+    def place(kind: str, of: str, signal: np.ndarray) -> _Place:
+        return _Place(kind, of, signal, np.abs(signal).max())
+
+    return [
+        *(place("start", entry, signal) for entry, signal in zip(entries, path.T, strict=True)),
+        *(_Place("acceleration", f"q{i}", signal, acceleration) for i, signal in enumerate(speeds.T)),
+        *(place("control", f"u{i}", signal) for i, signal in enumerate(inputs.T)),
+        *(place("sensor", f"sensor {entries[i]}", path[:, i]) for i in model.measured),
+    ]
+
+
+def _courses(place: _Place, state: Mapping[str, np.ndarray], own: Mapping[str, str]) -> dict[str, Any]:
+    """Return the courses of the effects that may act in a place, by name; ``own`` are further accelerations."""
+    known = {**state, "t": np.linspace(-1.0, 1.0, len(place.signal)), "x": place.signal}
+    texts = TERMS[place.kind]
+    if place.kind == "acceleration":
+        axis = place.of[1:]
+        texts = texts | {f"coupling with {entry}": entry for entry in state if entry[1:] != axis} | dict(own)
+        known |= {"q": state[place.of], "v": state[f"v{axis}"]}
+    return {f"{name} of {place.of}": evaluate(text, known) for name, text in texts.items()}
 
 
 def missing_terms(
@@ -525,42 +604,32 @@ def missing_terms(
     """Return the change of the standardised record ``(m,)`` per unit of effects that the model lacks, by name.
 
     The effects are :data:`TERMS`, accelerations in other coordinates, and the accelerations ``own``. They act along the
-    motion of ``theta (p,)``, to first order.
+    motion of ``theta (p,)``, to first order. A scene whose velocities are not those of its positions has no accelerations.
     """
-    entries, scene, steps = model.entries, model.program.scene, np.array(model.steps)
     path, controls = (part[:, :, 0] for part in model.motion(theta[:, None]))
-    state, n_v = dict(zip(entries, path.T, strict=True)), len(entries) - scene.n_q
-    signals = np.hstack(
-        [path, path[:, scene.n_q :], np.pad(controls, ((0, 1), (0, 0)), "edge"), path[:, model.measured]]
-    )
-    places = [
-        *(("start", entry) for entry in entries), *(("acceleration", f"q{i}") for i in range(n_v)),
-        *(("control", f"u{k}") for k in range(controls.shape[1])),
-        *(("sensor", f"sensor {entries[entry]}") for entry in model.measured),
-    ]  # fmt: skip
-    changes: dict[str, tuple[int, Any]] = {}
-    for place, (kind, of) in enumerate(places):
-        known = state | {"t": np.linspace(-1.0, 1.0, len(path)), "x": signals[:, place]}
-        texts = TERMS[kind]
-        if kind == "acceleration":
-            texts = texts | {f"coupling with {e}": e for e in entries if e[1:] != of[1:]} | dict(own or {})
-            known |= {"q": state.get(of), "v": state[f"v{of[1:]}"]}
-        if kind != "acceleration" or n_v == scene.n_q:
-            changes |= {f"{name} of {of}": (place, evaluate(text, known)) for name, text in texts.items()}
-    sizes = np.abs(signals).max(axis=0)
-    sizes[len(entries) :][:n_v] = np.abs(np.diff(path[:, scene.n_q :], axis=0)).max() / scene.dt
-    courses = np.zeros((*signals.shape, len(changes)))
-    for k, (place, course) in enumerate(changes.values()):
-        courses[:, place, k] = RELATIVE * sizes[place] * course / (np.abs(course).max() or 1.0)
-    ends = np.cumsum([len(entries), n_v, controls.shape[1]])
+    state, n_q = dict(zip(model.entries, path.T, strict=True)), model.program.scene.n_q
+    places, n_v = _places(model, path, controls), len(state) - n_q
+    acting = [
+        (k, name, course)
+        for k, place in enumerate(places)
+        if place.kind != "acceleration" or n_v == n_q
+        for name, course in _courses(place, state, own or {}).items()
+    ]
+    # of an effect when it is computed, relative to the largest value of what it acts on
+    relative = 1e-4
+    courses = np.zeros((len(path), len(places), len(acting)))
+    for column, (k, _, course) in enumerate(acting):
+        courses[:, k, column] = relative * places[k].size * course / (np.abs(course).max() or 1.0)
+    ends = np.cumsum([len(state), n_v, controls.shape[1]])
     starts, pushes, nudges, sensors = np.split(np.concatenate([courses, -courses], axis=2), ends, axis=1)
     wide = np.repeat(theta[:, None], starts.shape[2], axis=1)
     moved = model.record(wide, lambda s, *_: pushes[s], lambda s: nudges[s], starts[0])
-    up, down = np.split((moved + sensors[steps].reshape(moved.shape)) / (2.0 * RELATIVE * sigma), 2, axis=1)
+    seen = moved + sensors[np.array(model.steps)].reshape(moved.shape)
+    up, down = np.split(seen / (2.0 * relative * sigma), 2, axis=1)
     free = {name.replace(".", " of ") for name in model.names}
     return {
         name: effect
-        for name, effect in zip(changes, (up - down).T, strict=True)
+        for (_, name, _), effect in zip(acting, (up - down).T, strict=True)
         if name not in free and np.isfinite(effect).all() and effect.any()
     }
 
