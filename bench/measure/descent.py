@@ -82,66 +82,102 @@ class Descent:
         return Point(tuple(float(f"{value:.6g}") for value in theta), self.gradients[0], along)
 
 
+class _Objective:
+    """J_sigma of a problem and its gradient under given noise ``w (n_w, B)``.
+
+    The gradient is the mean of the program's gradients, or of costs times scores where the cost may jump or the backend
+    has no gradients.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        program = problem.program
+        self.problem = problem
+        self.is_smooth = program.continuous and not program.surrogate and "grad" in problem.provides
+
+    def cost(self, theta: np.ndarray, w: np.ndarray) -> float:
+        """Return the mean cost at ``theta (d,)``."""
+        return float(self.problem.value(theta, w).mean())
+
+    def gradient(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return the gradient ``(d,)`` at ``theta (d,)``."""
+        if self.is_smooth:
+            return self.problem.grad(theta, w).mean(axis=1)
+        costs = self.problem.value(theta, w)
+        return np.asarray(((costs - costs.mean()) * self.problem.score(theta, w)).mean(axis=1))
+
+
+@dataclass
+class _Path:
+    """The thetas of a descent so far, with their costs and gradients."""
+
+    thetas: list[np.ndarray]
+    costs: list[float]
+    slopes: list[np.ndarray]
+
+    def has_gained_all(self) -> bool:
+        """Return whether the last steps have gained a negligible share of the whole gain."""
+        costs = self.costs
+        return len(costs) > WINDOW and costs[-1 - WINDOW] - costs[-1] < ENOUGH * (costs[0] - costs[-1])
+
+
 @np.errstate(over="ignore", invalid="ignore")
 def descend(problem: Problem) -> Descent:
     """Return the descent of J_sigma from theta0 by gradient steps under common noise.
 
-    The gradient is the mean of the program's gradients, or of costs times scores where the cost may jump or the backend
-    has no gradients. A step that would raise the cost is halved.
+    A step that would raise the cost is halved. There is no descent where no optimum is reached.
     """
-    program, theta = problem.program, problem.program.theta0
-    is_smooth = program.continuous and not program.surrogate and "grad" in problem.provides
-    if not is_smooth and program.score_refusal:
-        return _none(program.score_refusal)
+    objective = _Objective(problem)
+    if not objective.is_smooth and problem.program.score_refusal:
+        return _none(problem.program.score_refusal)
     w, fresh = (_pairs(problem, block) for block in (0, 1))
-
-    def gradient(theta: np.ndarray, w: np.ndarray = w) -> np.ndarray:
-        if is_smooth:
-            return problem.grad(theta, w).mean(axis=1)
-        costs = problem.value(theta, w)
-        return np.asarray(((costs - costs.mean()) * problem.score(theta, w)).mean(axis=1))
-
-    def cost(theta: np.ndarray) -> float:
-        return float(problem.value(theta, w).mean())
-
-    scale = max(float(np.linalg.norm(theta)), problem.sigma * math.sqrt(theta.size))
-    thetas, costs, slopes, step = [theta], [cost(theta)], [gradient(theta)], 0.0
-    while math.isfinite(costs[-1]) and (size := float(np.linalg.norm(slopes[-1]))) > 0.0 and math.isfinite(size):
-        step = step or FIRST * scale / size
-        new = thetas[-1] - step * slopes[-1]
-        # step, relative to that length, below which no step lowers the cost
-        while not (reached := cost(new)) < costs[-1] and step * size > 1e-9 * scale:
-            step /= 2.0
-            new = thetas[-1] - step * slopes[-1]
-        if not reached < costs[-1]:
-            break
-        thetas.append(new)
-        costs.append(reached)
-        slopes.append(gradient(new))
-        step *= GROWTH if slopes[-1] @ slopes[-2] >= STRAIGHT * size**2 else 0.5
-        if len(costs) > WINDOW and costs[-1 - WINDOW] - costs[-1] < ENOUGH * (costs[0] - costs[-1]):
-            break
-        # distance of theta from 0, relative to that length, beyond which costs count as unbounded below
-        if len(costs) > STEPS or np.linalg.norm(new) > 1e3 * scale:
-            return _none(f"the cost still falls after {len(costs) - 1} steps, from {costs[0]:.4g} to {costs[-1]:.4g}")
-    norms = [float(np.linalg.norm(slope)) for slope in slopes]
+    path, has_ended = _followed(objective, problem.program.theta0, w)
+    costs, taken = path.costs, f"{len(path.costs) - 1} steps"
+    if not has_ended:
+        return _none(f"the cost still falls after {taken}, from {costs[0]:.4g} to {costs[-1]:.4g}")
+    norms = [float(np.linalg.norm(slope)) for slope in path.slopes]
     if not np.isfinite([*costs, *norms]).all():
         return _none(f"at step {len(costs) - 1} costs or gradients are not finite")
-    gain = problem.value(theta, fresh) - problem.value(thetas[-1], fresh)
+    gain = problem.value(path.thetas[0], fresh) - problem.value(path.thetas[-1], fresh)
     gain = gain.reshape(2, -1).mean(axis=0)
     error = float(gain.std(ddof=1)) / math.sqrt(gain.size)
     # standard errors by which the gain must exceed 0 on noise that the descent has not used
     if not gain.mean() > 3.0 * error:
         return _none(
-            f"from theta0 the cost falls by {gain.mean():.2g} +- {error:.2g} in {len(costs) - 1} steps: theta0 may be an optimum"
+            f"from theta0 the cost falls by {gain.mean():.2g} +- {error:.2g} in {taken}: theta0 may be an optimum"
         )
-    left = float(np.linalg.norm(gradient(thetas[-1], fresh))) / norms[0]
+    left = float(np.linalg.norm(objective.gradient(path.thetas[-1], fresh))) / norms[0]
     # gradient at the end, on noise that the descent has not used, relative to that at theta0, above which no
     # optimum was reached
     if not left < 0.5:
-        return _none(f"no optimum in {len(costs) - 1} steps: the gradient there is {left:.2g} times that at theta0")
-    path = np.array(thetas)
-    return Descent(path.tolist(), costs, norms, *_motion(problem, path))
+        return _none(f"no optimum in {taken}: the gradient there is {left:.2g} times that at theta0")
+    thetas = np.array(path.thetas)
+    return Descent(thetas.tolist(), costs, norms, *_motion(problem, thetas))
+
+
+def _followed(objective: _Objective, theta: np.ndarray, w: np.ndarray) -> tuple[_Path, bool]:
+    """Return the path from ``theta (d,)`` under noise ``w``, and whether it ends: False if the cost still falls."""
+    path = _Path([theta], [objective.cost(theta, w)], [objective.gradient(theta, w)])
+    scale = max(float(np.linalg.norm(theta)), objective.problem.sigma * math.sqrt(theta.size))
+    step = 0.0
+    while math.isfinite(path.costs[-1]) and 0.0 < (size := float(np.linalg.norm(path.slopes[-1]))) < math.inf:
+        step = step or FIRST * scale / size
+        new = path.thetas[-1] - step * path.slopes[-1]
+        # step, relative to that length, below which no step lowers the cost
+        while not (reached := objective.cost(new, w)) < path.costs[-1] and step * size > 1e-9 * scale:
+            step /= 2.0
+            new = path.thetas[-1] - step * path.slopes[-1]
+        if not reached < path.costs[-1]:
+            break
+        path.thetas.append(new)
+        path.costs.append(reached)
+        path.slopes.append(objective.gradient(new, w))
+        step *= GROWTH if path.slopes[-1] @ path.slopes[-2] >= STRAIGHT * size**2 else 0.5
+        if path.has_gained_all():
+            break
+        # distance of theta from 0, relative to that length, beyond which costs count as unbounded below
+        if len(path.costs) > STEPS or np.linalg.norm(new) > 1e3 * scale:
+            return path, False
+    return path, True
 
 
 def _none(reason: str) -> Descent:
