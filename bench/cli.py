@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from bench.experiment.views import Views
     from bench.run.execute import Finished
 
-FEW = 3
-"""Most files of a command that are listed one by one."""
 SETTINGS = """\
 Settings:
   scenes=[..] contacts=[..] integrators=[..] backends=[..] estimators=[..]
@@ -284,7 +282,8 @@ def _status(rows: pd.DataFrame) -> int:
 
 def _print_written(paths: Sequence[Path]) -> None:
     """Print where the files of a command are: each of a few files, or the folders of many, and the page."""
-    if len(paths) <= FEW:
+    # most files of a command that are listed one by one
+    if len(paths) <= 3:
         print("\nWritten:", *map(printable, paths), sep="\n  ")
         return
     counts = Counter(path.parent for path in paths)

@@ -20,10 +20,6 @@ REVISION = 1
 """Raised when a path that this module computes moves."""
 PAIRS = 1024
 """Pairs of rollouts with noise of either sign, the same at every step: J_sigma is their mean cost."""
-STEPS = 400
-"""Most steps of a descent."""
-FIRST = 0.02
-"""Length of the first step relative to theta0, or to the noise on all of theta if that is larger."""
 GROWTH, STRAIGHT = 1.5, 0.9
 """The step size grows by this factor where the gradient along a step falls to no less than this share, and is halved elsewhere."""
 WINDOW, ENOUGH = 10, 1e-3
@@ -157,10 +153,12 @@ def descend(problem: Problem) -> Descent:
 def _followed(objective: _Objective, theta: np.ndarray, w: np.ndarray) -> tuple[_Path, bool]:
     """Return the path from ``theta (d,)`` under noise ``w``, and whether it ends: False if the cost still falls."""
     path = _Path([theta], [objective.cost(theta, w)], [objective.gradient(theta, w)])
+    # the length of theta0, or that of the noise on all of theta if it is larger
     scale = max(float(np.linalg.norm(theta)), objective.problem.sigma * math.sqrt(theta.size))
     step = 0.0
     while math.isfinite(path.costs[-1]) and 0.0 < (size := float(np.linalg.norm(path.slopes[-1]))) < math.inf:
-        step = step or FIRST * scale / size
+        # the first step has a fiftieth of that length
+        step = step or 0.02 * scale / size
         new = path.thetas[-1] - step * path.slopes[-1]
         # step, relative to that length, below which no step lowers the cost
         while not (reached := objective.cost(new, w)) < path.costs[-1] and step * size > 1e-9 * scale:
@@ -174,8 +172,8 @@ def _followed(objective: _Objective, theta: np.ndarray, w: np.ndarray) -> tuple[
         step *= GROWTH if path.slopes[-1] @ path.slopes[-2] >= STRAIGHT * size**2 else 0.5
         if path.has_gained_all():
             break
-        # distance of theta from 0, relative to that length, beyond which costs count as unbounded below
-        if len(path.costs) > STEPS or np.linalg.norm(new) > 1e3 * scale:
+        # most steps, and the distance of theta from 0, relative to that length, from which costs count as unbounded below
+        if len(path.costs) > 400 or np.linalg.norm(new) > 1e3 * scale:
             return path, False
     return path, True
 

@@ -46,8 +46,6 @@ SEARCHED, SEARCH = 5.0, (1 << 11, 1 << 13)
 """Distance searched for narrow features on lines through w = 0, and panels of the coarse and the fine rule on a line."""
 SOLVED = 1e-11
 """Relative error of costs of programs whose steps solve an equation to 1e-12."""
-ROUNDED = 64.0
-"""Relative rounding error of the integral of absolute values, in unit roundoffs: a node's weight has a few."""
 PROBES, STEP = 32, 1e-7
 """Number of stencils that measure the cost's rounding noise, and the spacing of their points in standard deviations."""
 
@@ -206,7 +204,8 @@ def _integral(
         doubts.append("the cost has a feature narrower than the spacing of the points")
     if power >= 0.5:
         doubts.append(f"the cost grows as 1 / distance^{power:.2g}, so samples have no variance")
-    solved = SOLVED if integrand.problem.program.needs_root else ROUNDED * np.finfo(float).eps
+    # relative rounding error of the integral of absolute values, in unit roundoffs: a node's weight has a few
+    solved = SOLVED if integrand.problem.program.needs_root else 64.0 * np.finfo(float).eps
     error += limits.beyond / sigma + rounding + solved * level.size
     return Integral(mean, error, used, spacing, "; ".join(doubts))
 

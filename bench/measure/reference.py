@@ -24,8 +24,6 @@ small. The pilot, which selects the estimator of a sampled reference, is one bat
 LEAST_SAMPLES = 16384
 """Minimum samples of a sampled reference, unless the limit is lower: a small spread of few samples proves nothing."""
 QUADRATURE_POINTS = 1 << 20
-FINE = 1e-3
-"""Spacing of a reference's points, in standard deviations, above which a note states it: that of points in a plane."""
 TAIL_EVENTS = 10.0
 """Expected samples in the tails. Their contribution is estimated separately, as a spread may not show so few samples."""
 DEEPER = 0.2
@@ -36,9 +34,6 @@ FAR = 4.5
 """Distance searched for jumps on either side along a direction, in standard deviations."""
 ROUNDING = 1e-9
 """Difference of first and zeroth order, relative to the gradient, that rounding explains."""
-SAME = 1e-6
-"""Difference between two backends' costs of one draw, relative to the range of costs, that rounding explains. The root of
-the coarser unit roundoff is allowed too, and :data:`LAST` roundoffs of the cost itself."""
 LAST = 100.0
 SHARED = 1e-10
 """Relative error common to the terms of all samples, from rounding and central differences."""
@@ -125,7 +120,9 @@ def certify(
         given = problem if unit == 1.0 else cast(Problem, _Scaled(problem, unit))
         scaled = _compute(given, theta, provides, samples, tolerance, min(points, 64 * samples))
         reference = replace(scaled, batches=scaled.batches * unit, error=scaled.error * unit)
-        if reference.spacing > FINE:
+        # spacing of a reference's points, in standard deviations, above which a note states it: that of points in a
+        # plane
+        if reference.spacing > 1e-3:
             note = f"the reference's points are {reference.spacing:.2g} standard deviations apart and may miss a narrower feature"
             reference = with_note(reference, note)
     if physical is None or "grad" not in provides:
@@ -149,7 +146,10 @@ def transferred(reference: Reference, problem: Problem, other: Problem, samples:
         with np.errstate(all="ignore"):
             mine, others = problem.value(theta, w), other.value(theta, w)
             spread = np.ptp(mine[np.isfinite(mine)]) if np.isfinite(mine).any() else 0.0
-            allowed = max(SAME, math.sqrt(unit)) * spread + LAST * unit * np.abs(mine)
+            # difference between two backends' costs of one draw, relative to the range of costs, that rounding
+            # explains. The root of the coarser unit roundoff is allowed too, and :data:`LAST` roundoffs of the cost
+            # itself
+            allowed = max(1e-6, math.sqrt(unit)) * spread + LAST * unit * np.abs(mine)
             agrees = (mine == others) | (np.abs(others - mine) <= allowed) | (np.isnan(mine) & np.isnan(others))
             share += float(1.0 - agrees.mean()) / blocks
             apart = np.where(agrees, 0.0, others - mine)

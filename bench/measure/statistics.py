@@ -27,11 +27,6 @@ REVISION = 1
 
 ROUNDING = 1e-12
 """Differences below this share of a gradient's size are rounding: no bias, and no spread of the estimates."""
-FEW_REPEATS = 8
-"""Fewest repeats for a test of tails; a note reports fewer."""
-CONCENTRATION = 0.75
-"""Tails are heavy when (sum y)^2 / sum y^2 of the squared deviations y is below this times sqrt(R). That holds for 5%
-of cells with normal noise at R = 8, 1% at 16, none of thousands at 64, and half of cells with kurtosis 100."""
 THREE = 3.0
 """Numerator of the rule of three: an event absent from n trials has a probability below 3 / n, at 95% confidence."""
 PHYSICS = "physics: "
@@ -559,7 +554,9 @@ def heavy_tails(deviations: np.ndarray) -> float:
     """Return the largest share of one repeat in the squares of ``deviations (R, d)``, or 0 if tails are not heavy."""
     squares = np.einsum("rd,rd->r", deviations, deviations)
     total, fourth = float(squares.sum()), float(squares @ squares)
-    if fourth > 0.0 and total**2 / fourth < CONCENTRATION * math.sqrt(len(deviations)):
+    # tails are heavy when (sum y)^2 / sum y^2 of the squared deviations y is below this times sqrt(R). That holds for
+    # 5% of cells with normal noise at R = 8, 1% at 16, none of thousands at 64, and half of cells with kurtosis 100
+    if fourth > 0.0 and total**2 / fourth < 0.75 * math.sqrt(len(deviations)):
         return float(squares.max()) / total
     return 0.0
 
@@ -574,7 +571,8 @@ def _interval_remarks(deviations: np.ndarray, difference: np.ndarray, missed: fl
             "all estimates are identical: the intervals allow for an event of the gradient's size, rarer than about "
             f"{missed:.2g} per sample, which these samples would miss"
         ]
-    if repeats < FEW_REPEATS:
+    # fewest repeats for a test of tails; a note reports fewer
+    if repeats < 8:
         return [f"only {repeats} repeats: intervals are wide, and tails are not tested"]
     for part, where in ((deviations, ""), ((deviations @ difference)[:, None], " along the bias")):
         if share := heavy_tails(part):

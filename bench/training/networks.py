@@ -11,9 +11,6 @@ import jax.numpy as jnp
 
 from bench.model.ops import Array
 
-SMALLEST_VARIANCE = 1e-5
-"""Added to the variance of a hidden layer, so that equal outputs do not divide by 0."""
-
 
 def normalised_elu(x: Array) -> Array:
     """Return ELU's outputs normalised over the units (Ba et al. 2016, arXiv 1607.06450, without gain and bias).
@@ -21,7 +18,8 @@ def normalised_elu(x: Array) -> Array:
     Without it, one seed in five of SHAC ends lower on the cart-pole.
     """
     x = jax.nn.elu(x)
-    return (x - x.mean(axis=0)) / jnp.sqrt(x.var(axis=0) + SMALLEST_VARIANCE)
+    # added to the variance of a hidden layer, so that equal outputs do not divide by 0
+    return (x - x.mean(axis=0)) / jnp.sqrt(x.var(axis=0) + 1e-5)
 
 
 ACTIVATIONS = {"normalised_elu": normalised_elu, "tanh": jnp.tanh}

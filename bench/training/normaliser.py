@@ -8,11 +8,6 @@ import jax.numpy as jnp
 
 from bench.model.ops import Array
 
-FIRST_COUNT = 1e-4
-"""Weight of the initial mean 0 and variance 1, so small that the first observations replace them."""
-FLOOR = 1e-5
-"""Added to the variance, so that a constant observation does not divide by 0."""
-
 
 class Normaliser(NamedTuple):
     """Count, mean ``(n,)`` and variance ``(n,)`` of all observations so far."""
@@ -24,7 +19,8 @@ class Normaliser(NamedTuple):
 
 def start(n: int, dtype: Any) -> Normaliser:
     """Return the normaliser before the first observation."""
-    return Normaliser(jnp.asarray(FIRST_COUNT, dtype), jnp.zeros(n, dtype), jnp.ones(n, dtype))
+    # weight of the initial mean 0 and variance 1, so small that the first observations replace them
+    return Normaliser(jnp.asarray(1e-4, dtype), jnp.zeros(n, dtype), jnp.ones(n, dtype))
 
 
 def updated(known: Normaliser, observations: Array) -> Normaliser:
@@ -39,7 +35,8 @@ def updated(known: Normaliser, observations: Array) -> Normaliser:
 
 def deviation(known: Normaliser) -> Array:
     """Return the standard deviations, ``(n,)``."""
-    return jnp.sqrt(known.variance + FLOOR)
+    # added to the variance, so that a constant observation does not divide by 0
+    return jnp.sqrt(known.variance + 1e-5)
 
 
 def normalised(known: Normaliser, observations: Array) -> Array:

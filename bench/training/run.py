@@ -20,8 +20,6 @@ from bench.training.environment import Environment
 
 _compiled: dict[tuple[Any, ...], tuple[Callable[..., Any], float]] = {}
 """Executables and the seconds of their compilation, by environment structure, trainer, function and shapes."""
-LARGE = 1e8
-"""Mean square far above that of gradients, whose norm trainers clip at about 1."""
 
 
 class Training:
@@ -101,7 +99,8 @@ class Training:
 
         def move(env: Environment, state: Any) -> Any:
             means = jax.tree.map(jnp.zeros_like, optax.tree.get(state.memory, "mu"))
-            squares = jax.tree.map(lambda x: x + LARGE, means)
+            # mean square far above that of gradients, whose norm trainers clip at about 1
+            squares = jax.tree.map(lambda x: x + 1e8, means)
             memory = optax.tree.set(state.memory, mu=means, nu=squares)
             after, _ = self.trainer.update(env, state._replace(memory=memory))
             change = ravel_pytree(state.actor)[0] - ravel_pytree(after.actor)[0]

@@ -12,15 +12,13 @@ import optax
 from bench.errors import UserError
 from bench.model.ops import Array
 
-LAST_RATE = 1e-5
-"""Learning rate at the end of a run (Xu et al. 2022, public configuration)."""
-
 
 def adam(
     rate: float, updates: int, clip: float, beta1: float = 0.7, beta2: float = 0.95
 ) -> optax.GradientTransformation:
     """Return Adam with a norm clipped at ``clip``, and a rate that falls linearly to 1e-5 over ``updates`` steps."""
-    schedule = optax.linear_schedule(rate, min(LAST_RATE, rate), updates)
+    # learning rate at the end of a run (Xu et al. 2022, public configuration)
+    schedule = optax.linear_schedule(rate, min(1e-5, rate), updates)
     return optax.chain(optax.clip_by_global_norm(clip), optax.adam(schedule, b1=beta1, b2=beta2))
 
 

@@ -4,9 +4,6 @@ from dataclasses import dataclass
 
 from bench.model import Contact, ImpulseLaw, Ops, State, param
 
-TIE = 1e-9
-"""Fraction of a step within which an impact counts as at the start of the step: a little above rounding errors."""
-
 
 @dataclass(frozen=True)
 class Impulse(ImpulseLaw):
@@ -44,5 +41,6 @@ class Impulse(ImpulseLaw):
             return State(0.0 * dv, dv)
         early = overlap / approach - dt
         # includes a gap of exactly 0 before the step, whose time of impact also changes with theta
-        early = xp.where(early <= TIE * dt, early, 0.0 * early)
+        # fraction of a step within which an impact counts as at the start of the step: a little above rounding errors
+        early = xp.where(early <= 1e-9 * dt, early, 0.0 * early)
         return State(contact.acceleration(before.q, strength * early), dv)

@@ -7,11 +7,6 @@ import numpy as np
 
 from bench.model import Auxiliaries, DiagnosticEstimator, Problem, first_order, halves, param, per_unit, zeroth_order
 
-RARE = 2.0
-"""gamma / eps from which hardly any estimate of a smooth cost reaches the cap."""
-PRECISE = 0.9
-"""Weight above which the first order's variance is below a ninth of the zeroth order's."""
-
 
 @dataclass(frozen=True)
 class AlphaOrder(DiagnosticEstimator):
@@ -48,7 +43,9 @@ class AlphaOrder(DiagnosticEstimator):
     def remark(self, diagnostics: Mapping[str, Mapping[str, float]]) -> str:
         """Return a doubt where few estimates reach the cap, and differ from the others by much more than these vary."""
         ratio = self.ratio if self.gamma is None else self.gamma / max(diagnostics["eps"]["median"], 1e-300)
-        if 1.0 < ratio < RARE and diagnostics["alpha"]["median"] > PRECISE:
+        # from gamma / eps = 2 on, hardly any estimate of a smooth cost reaches the cap; above a weight of .9, the first
+        # order's variance is below a ninth of the zeroth order's
+        if 1.0 < ratio < 2.0 and diagnostics["alpha"]["median"] > 0.9:
             return "rare estimates, in which gamma - eps limits alpha, hold most of the variance: its intervals are too narrow"
         return ""
 

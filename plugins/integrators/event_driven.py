@@ -7,9 +7,6 @@ from bench.model import Array, Contact, Dynamics, State
 
 from .stormer_verlet import StormerVerlet, flight
 
-LATE = 1e-3
-"""Fraction of a step by which an impact may lie in the past, since rounding may delay its detection."""
-
 
 @dataclass(frozen=True)
 class EventDriven(StormerVerlet):
@@ -52,6 +49,7 @@ def _first_impact(xp: Any, contact: Contact, state: State, a: Array, dt: Any) ->
     soon = 2.0 * gap / xp.where(approaching, speed - rate, 0.0 * rate + 1.0)
     later = (rate + speed) / xp.where(pulled, -bend, 0.0 * bend + 1.0)
     time = xp.where(approaching, soon, later)
-    hit = crossing & (approaching | pulled) & (time > -LATE * dt) & (time < dt)
+    # fraction of a step by which an impact may lie in the past, since rounding may delay its detection
+    hit = crossing & (approaching | pulled) & (time > -1e-3 * dt) & (time < dt)
     first = xp.min(xp.where(hit, time, 0.0 * time + dt), axis=0, keepdims=True)
     return xp.where(xp.any(hit, axis=0, keepdims=True), first, 0.0 * first)

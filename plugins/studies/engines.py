@@ -31,9 +31,6 @@ if TYPE_CHECKING:
 
 SUMMARY = ("reference_norm", "reference_se", "bias", "bias_low", "bias_high", "variance", "rmse_rel")
 """Columns that are statistics of averaged gradients."""
-ACCURATE = 0.02
-"""Relative program error up to which a gradient counts as the derivative of its program. Differences of float32 costs
-have two digits."""
 SAME = 0.1
 """Relative model error up to which a gradient counts as the gradient of the model."""
 USELESS = 1.0
@@ -197,7 +194,9 @@ def levels(rows: pd.DataFrame) -> np.ndarray:
     low, high = rmse_interval(with_variance_interval(rows))
     reach = 2.0 * rows["reference_se"] / rows["reference_norm"]
     low, high = low / (1.0 + reach), (high / (1.0 - reach)).where(reach < 1.0, np.inf)
-    is_right = (rows["status"] == "ok") & ~(rows["nan_share"] > 0) & (rows["program_error_rel"] <= ACCURATE)
+    # relative program error up to which a gradient counts as the derivative of its program. Differences of float32
+    # costs have two digits
+    is_right = (rows["status"] == "ok") & ~(rows["nan_share"] > 0) & (rows["program_error_rel"] <= 0.02)
     kinds = {
         "none": rows["gradient"].map(len) == 0, "wrong": ~is_right, "noisy": low >= USELESS, "open": ~(high < USELESS),
         "right": rows["model_error_rel"] <= SAME,

@@ -20,15 +20,11 @@ from . import PARTS, StudyPackage, finite_status, first_batch, gradient_seconds,
 if TYPE_CHECKING:
     import pandas as pd
 
-FLOOR = 1e-6
-"""Smallest relative error that is drawn; smaller ones, 0 included, are drawn here as upper limits."""
 SHOWN = ("solver_residual", "gradient_error_rel", "gradient_cosine", "wrong_signs", "gradient_s", "compile_s")
 NOTES = (
     "Gradients at theta without noise, compared with the gradient of the same program with a converged solver. The residual "
     "of the solver is relative to the forces of a step. Times are of one batch of `samples` rollouts.",
 )
-ROUNDING = 1e-6
-"""Share of the gradient's norm up to which a coordinate of the converged gradient has no sign."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +65,8 @@ class Solver(StudyPackage):
         w = first_batch(cell, problem.program.n_noise)
         # both batches have the same shape, so that each program is compiled once
         gradient, target = (one.grad(problem.program.theta0, np.zeros_like(w))[:, 0] for one in (problem, limit))
-        has_sign = np.abs(target) > ROUNDING * norm(target)
+        # share of the gradient's norm up to which a coordinate of the converged gradient has no sign
+        has_sign = np.abs(target) > 1e-6 * norm(target)
         return {
             **finite_status("a gradient is not finite", gradient, target), "iterations": backend.iterations,
             "gradient": gradient.tolist(), "converged_gradient": target.tolist(),
@@ -90,8 +87,9 @@ class Solver(StudyPackage):
         )
         iterations = shown.column("iterations", label="iterations of the solver", log=True)
         error = shown.column("gradient_error_rel", label="relative error", limit="gradient_error_rel_limit", log=True)
+        # smallest relative error that is drawn; smaller ones, 0 included, are drawn here as upper limits
         chart = Chart(
-            "solver", floored(shown.good, FLOOR, [error.name]), [iterations], [error], series="method", panel="problem",
+            "solver", floored(shown.good, 1e-6, [error.name]), [iterations], [error], series="method", panel="problem",
             marks=[Mark("as large as the gradient", 1.0, axis="y")], subtitle="against the gradient of the program with a converged solver",
         )  # fmt: skip
         return Views([cells], [chart])

@@ -39,8 +39,6 @@ from . import StudyPackage, norm, spectral_radius
 if TYPE_CHECKING:
     import pandas as pd
 
-NEGLIGIBLE = 1e-9
-"""Share of the truth's norm up to which one of its components counts as 0."""
 NEUTRAL = 1 + 1e-9
 """Spectral radius, theoretical or measured, up to which a step counts as stable: 1 plus rounding."""
 REACH = np.logspace(-3, 4, 141)
@@ -297,19 +295,13 @@ def compare(gradient: np.ndarray, truth: np.ndarray, inaccurate: float) -> dict[
     length, size, distance = norm(truth), norm(gradient), norm(gradient - truth)
     error = distance / length if length else math.inf if distance else 0.0
     cosine = float(gradient / size @ (truth / length)) if length and size else math.nan
-    is_zero = ((gradient == 0) & (np.abs(truth) > NEGLIGIBLE * length)).any()
+    # share of the truth's norm up to which one of its components counts as 0
+    is_zero = ((gradient == 0) & (np.abs(truth) > 1e-9 * length)).any()
     verdict = "zero" if is_zero else "wrong_sign" if cosine < 0 else "ok" if error <= inaccurate else "inaccurate"
     return {"verdict": verdict, "relative_error": error, "cosine": cosine}
 
 
 # ---------------------------------------------------------------------------------------------------- cause
-
-SPAN = 0.01
-"""Step in theta for central differences of the law's own cost, in units of theta's largest component (1 if that is 0).
-
-It is large enough to shift an impact by many fine steps, which averages out the effect of the impact's time within a
-step.
-"""
 
 
 def cause_of(cell: Cell, truth_kind: str, gradient: np.ndarray, truth: np.ndarray, limits: Stability) -> dict[str, Any]:
@@ -326,7 +318,10 @@ def cause_of(cell: Cell, truth_kind: str, gradient: np.ndarray, truth: np.ndarra
         return {"cause": "step", "step_error": error, "law_error": 0.0}
     if not size:
         return {"cause": "unknown"}
-    fine, coarse = finest(cell, limits, SPAN)
+    # step in theta for central differences of the law's own cost, in units of theta's largest component (1 if that is
+    # 0). It is large enough to shift an impact by many fine steps, which averages out the effect of the impact's time
+    # within a step
+    fine, coarse = finest(cell, limits, 0.01)
     step, law, change = (norm(part) / size for part in (gradient - fine, fine - truth, fine - coarse))
     errors = {"step_error": step, "law_error": law}
     if not change <= limits.inaccurate / 2:

@@ -35,18 +35,10 @@ SUMMARY = (
     "sign_agreement",
 )  # fmt: skip
 """Columns that are statistics of the estimator."""
-ROUNDING = 1e-9
-"""Share of a gradient's norm up to which a coordinate counts as rounding error and its sign as 0."""
 STEPS = 10.0 ** -np.arange(1.0, 9.5, 0.5)
 """Step sizes of the central differences, in the units of theta."""
-EXACT = 1e-6
-"""Program error up to which a gradient counts as exact."""
 CONVERGED = 0.5
 """A cost or gradient converges if its error falls at least to this share from the largest to the smallest step."""
-WRONG = 0.1
-"""Smallest model error of a wrong gradient."""
-FLOOR = 1e-16
-"""Smallest error that is drawn; smaller ones, 0 included, are drawn here as upper limits."""
 RESULTS = ("forward_error_rel", "program_error_rel", "model_error_rel", "model_cosine", "model_signs")
 OWN, PHYSICS, TRAP = "program error", "model error", "model error of a trap"
 STYLES = {
@@ -179,7 +171,8 @@ def _against_physics(program: Program, cost: float, gradient: np.ndarray) -> dic
 
 def _signs(gradient: np.ndarray) -> np.ndarray:
     """Return the signs of a gradient's coordinates, 0 where a coordinate is rounding error."""
-    return np.where(np.abs(gradient) > ROUNDING * norm(gradient), np.sign(gradient), 0.0)
+    # share of a gradient's norm up to which a coordinate counts as rounding error and its sign as 0
+    return np.where(np.abs(gradient) > 1e-9 * norm(gradient), np.sign(gradient), 0.0)
 
 
 # ------------------------------------------------------------------------------------------------- what is shown
@@ -201,8 +194,10 @@ def traps(shown: Shown) -> pd.DataFrame:
         steps = rows.drop_duplicates("dt")
         forward, model, cosine, program = (steps[name] for name in (*names, "program_error_rel"))
         converges = forward.is_monotonic_increasing and forward.iloc[0] <= CONVERGED * forward.iloc[-1]
-        stays_wrong = model.iloc[0] > max(CONVERGED * model.iloc[-1], WRONG)
-        is_trap = ((cosine < 0).all() or stays_wrong) and program.max(skipna=False) <= EXACT and converges
+        # smallest model error of a wrong gradient
+        stays_wrong = model.iloc[0] > max(CONVERGED * model.iloc[-1], 0.1)
+        # program error up to which a gradient counts as exact
+        is_trap = ((cosine < 0).all() or stays_wrong) and program.max(skipna=False) <= 1e-6 and converges
         if is_trap and len(steps) > 1:
             lines += [[problem, shown.column(name).heading, *steps[name].iloc[[-1, 0]]] for name in names]
     return pd.DataFrame(lines, columns=["problem", "error", "largest", "smallest"])
@@ -221,7 +216,8 @@ def _dumbbells(shown: Shown, trapped: pd.DataFrame) -> Chart:
     laws = [problem_names(shown.arranged, PARTS[1:], shown.over, ["contact"], own) for _, own in rows.groupby(scene)]
     rows = rows.assign(panel=scene, law=pd.concat(laws)).drop_duplicates(["panel", "law"]).sort_index()
     errors = stacked(rows, {OWN: "program_error_rel", PHYSICS: "model_error_rel"}, "error")
-    errors = floored(errors.sort_values("row", kind="stable"), FLOOR, ["error"]).dropna(subset=["error"])
+    # smallest error that is drawn; smaller ones, 0 included, are drawn here as upper limits
+    errors = floored(errors.sort_values("row", kind="stable"), 1e-16, ["error"]).dropna(subset=["error"])
     is_trap = errors["problem"].isin(trapped["problem"]) & (errors["series"] == PHYSICS)
     return Chart(
         "three_errors", errors.assign(series=errors["series"].mask(is_trap, TRAP)).reset_index(drop=True),

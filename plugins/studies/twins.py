@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 FLOOR = 1e-17
 """Smallest difference that is drawn; smaller ones, 0 included, are drawn here as upper limits."""
-ROUNDING = 1e-6
-"""Relative difference above which a twin's states or gradient count as different. Accumulated rounding is smaller."""
 DIFFERENCES = ("gradient_difference_rel", "state_difference_rel", "cost_difference_rel")
 SHOWN = (
     "state_difference", "state_difference_rel", "cost_difference_rel", "gradient_difference_rel", "gradient_cosine",
@@ -112,9 +110,11 @@ class Twins(StudyPackage):
         cells = shown.cells(SHOWN, "engines compared with the scenes' own programs", NOTES)
         worst = shown.good.groupby("problem")["gradient_difference_rel"].transform("max")
         frame = floored(shown.good.loc[worst.sort_values(ascending=False, kind="stable").index], FLOOR, DIFFERENCES)
+        # relative difference above which a twin's states or gradient count as different. Accumulated rounding is
+        # smaller
         chart = Chart(
             "twins", frame, [shown.column(name, limit=f"{name}_limit", log=True, label=self.columns.by_name[name].doc) for name in DIFFERENCES],
-            [text("problem", label="")], "dots", series="method", marks=[Mark("rounding up to here", ROUNDING)], height=0.3,
+            [text("problem", label="")], "dots", series="method", marks=[Mark("rounding up to here", 1e-6)], height=0.3,
             text="One dot per problem and engine. Left of the dashed line a difference is accumulated rounding.",
         )  # fmt: skip
         return Views([cells], [chart])

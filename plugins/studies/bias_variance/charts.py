@@ -36,8 +36,6 @@ from .time_to_accuracy import methods as methods_by_cost
 
 FLOOR = 1e-4
 """Relative biases below this are drawn here, as upper limits."""
-SERIES = 6
-"""Most estimators of a chart along an axis, where the experiment does not name them."""
 GRADES = {0.1: "#08519c", 0.3: "#6baed6", 1.0: "#d6e6f4", 10.0: "#fdae61", math.inf: "#c51b1b"}
 """Upper ends of the grades of an error, and their colours."""
 PANELS = 4
@@ -141,7 +139,8 @@ def _along(
     drawn, notes = choose_problems(problems)
     backends = shown.experiment.compares.get("backends", ())
     frame = pd.concat([_lines(problem, backends) for problem in problems], ignore_index=True)
-    names = shown.experiment.compares.get("estimators") or list(dict.fromkeys(frame["label"]))[:SERIES]
+    # most estimators of a chart along an axis, where the experiment does not name them
+    names = shown.experiment.compares.get("estimators") or list(dict.fromkeys(frame["label"]))[:6]
     total = frame["label"].nunique()
     shares = [f"{len(names)} of {total} estimators"] if len(names) < total else []
     for column, kept in (("label", names), ("panel", [problem.title() for problem in drawn])):

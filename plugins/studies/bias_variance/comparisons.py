@@ -23,13 +23,8 @@ from .time_to_accuracy import ROLLOUTS, couples_samples
 WORKS, FAILS, OPEN, NO_RESULT = "works", "fails", "open", "no result"
 """Verdicts of a method at a setting: its interval is below 1; above 1, or every estimate is 0; contains 1 or is not known; it
 has no number."""
-NEAR = 2.0
-"""A method whose error is more than this many times the lowest does not share the first place: the order is open."""
 SAME_COST = 1.05
 """Costs within this factor count as equal: a call at w = 0 that all samples share makes 101 rollouts of 100."""
-FASTEST = 2.0
-"""Power of the rollouts by which an error may fall at most without a law: N^-1.5 for a Sobol set and a smooth cost. A fitted
-model may become exact."""
 LAW = (
     "bias", "bias_low", "bias_high", "variance", "variance_low", "variance_high", "reference_norm", "reference_se", "rmse_rel",
 )  # fmt: skip
@@ -162,9 +157,9 @@ def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:
         scale = (spent / cost).where(of["has_law"]).mask(same[cost], 1.0) if apart else spent
         found = _scaled(nearest, scale.loc[nearest.index]).assign(rollouts=cost)
         share = (spent.loc[nearest.index] / cost).where(~found["has_law"] & ~found["has_fixed_work"]).clip(upper=1.0)
-        found["error_low"] = found["error_low"] * (share**FASTEST).fillna(1.0).mask(
-            found["is_fitted"] & (share < 1.0), 0.0
-        )
+        # power of the rollouts by which an error may fall at most without a law: N^-1.5 for a Sobol set and a smooth
+        # cost. A fitted model may become exact
+        found["error_low"] = found["error_low"] * (share**2.0).fillna(1.0).mask(found["is_fitted"] & (share < 1.0), 0.0)
         if is_swept:
             found = found.assign(setting=f"{problem}; rollouts {cost:.3g}", axis="rollouts", at=float(f"{cost:.3g}"))
         parts.append(found)
@@ -256,7 +251,8 @@ def _compared(level: pd.DataFrame) -> dict[str, Any]:
     # the next of another estimator, where there is one
     second = int(np.argmax(others["estimator"] != first["estimator"]))
     tied = others[~(factors[1] > 1)]
-    near = tied.loc[~(tied["error"] > NEAR * first["error"]), "method"]
+    # a method whose error is more than this many times the lowest does not share the first place: the order is open
+    near = tied.loc[~(tied["error"] > 2.0 * first["error"]), "method"]
     line |= {
         "second": others["method"].iloc[second],
         "tied": tuple(tied["method"]),

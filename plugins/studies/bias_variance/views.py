@@ -95,8 +95,6 @@ REMARKED = "?"
 """Mark of a cell whose row has a remark."""
 LEAST = 3
 """Fewest estimators for which the ranking is written; the main table is enough for fewer."""
-MANY = 2.5
-"""The number of evaluations per sample is shown above this value."""
 ESTIMATOR = text("method", label="estimator")
 
 
@@ -233,7 +231,8 @@ def ranking(methods: pd.DataFrame, equal: pd.DataFrame) -> Table:
     worst = equal.assign(known=equal["error"].fillna(math.inf)).sort_values("known", kind="stable")
     worst = worst.drop_duplicates(["estimator", "problem"], keep="last")
     shares = worst["verdict"] + np.where(worst["bias_share"] > 0.5, ", biased", "")
-    work = worst["evaluations"].map(" ({:.0f}x)".format).where(worst["evaluations"] > MANY, "")
+    # the number of evaluations per sample is shown above this value
+    work = worst["evaluations"].map(" ({:.0f}x)".format).where(worst["evaluations"] > 2.5, "")
     notes = shares.mask(worst["status"] != "ok", worst["status"]).mask(worst["not_comparable"], "not comparable") + work
     ends = {end: worst[f"error{end}"] for end in ("", "_low", "_high", "_is_limit")}
     problems, cells = equal["problem"].unique(), pd.DataFrame(ends | {"_note": notes}).set_axis(worst["estimator"])

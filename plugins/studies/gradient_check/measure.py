@@ -25,12 +25,6 @@ from . import GradientCheck, is_trusted
 
 COLUMNS_AT_ONCE = 128
 """Rollouts per evaluation. The number is fixed, so that a compiling backend compiles once."""
-COMPLEX_STEP = 1e-100
-"""Largest imaginary part of theta in a complex step; its square underflows beside every cost."""
-SAME_COST = 1e-3
-"""Relative difference between the costs of two array libraries: a chaotic rollout amplifies their rounding."""
-NEUTRAL = 1e-9
-"""Relative growth of the state per step up to which rounding may be the cause."""
 
 
 @dataclass(frozen=True)
@@ -212,7 +206,8 @@ def complex_step(problem: Problem, theta: np.ndarray, direction: np.ndarray, w: 
     program = problem.program
     if program.contact is not None or program.needs or program.surrogate or "physics" in problem.provides:
         return math.nan
-    size = COMPLEX_STEP / max(float(np.abs(direction).max()), 1e-300)
+    # largest imaginary part of theta in a complex step; its square underflows beside every cost
+    size = 1e-100 / max(float(np.abs(direction).max()), 1e-300)
     try:
         with np.errstate(all="ignore"):
             value = program.cost(
@@ -221,7 +216,8 @@ def complex_step(problem: Problem, theta: np.ndarray, direction: np.ndarray, w: 
             real = problem.value(theta, w[:, None])[0]
     except Exception:  # code of a plugin that does not run on complex numbers
         return math.nan
-    if not abs(complex(value).real - real) <= SAME_COST * abs(real):
+    # relative difference between the costs of two array libraries: a chaotic rollout amplifies their rounding
+    if not abs(complex(value).real - real) <= 1e-3 * abs(real):
         return math.nan
     return float(complex(value).imag / size)
 
@@ -275,7 +271,8 @@ def beyond_stability(cell: Cell) -> list[str]:
     response = float(scene.contact(np).response(np, first.q).max())
     factor = float(getattr(scene, "velocity_factor", 1.0))
     growth = spectral_radius(integrator, float(scene.dt), spring[0] * response, spring[1] * response, factor)
-    if growth <= 1.0 + NEUTRAL:
+    # relative growth of the state per step up to which rounding may be the cause
+    if growth <= 1.0 + 1e-9:
         return []
     return [
         f"the step is beyond the stability limit of the contact: each step in contact multiplies the state by up to "

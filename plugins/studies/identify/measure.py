@@ -37,20 +37,14 @@ from .record import evaluate, expressions, read
 
 STEP = 1e-5
 """Step of central differences in the coordinates of unknowns. Its relative error is about 1e-10."""
-NOTICEABLE = 0.01
-"""Least size of an unknown without a logarithm, in units of its scale, that becomes its scale."""
 SHOOTING = ("single", "multiple", "windows")
 """Shooting methods: one rollout, consecutive windows joined by a penalty on gaps, and independent windows."""
-GAP_WEIGHT = 100.0
-"""Weight of a gap between windows of multiple shooting, relative to the weight of a measurement."""
 NOISE = 0.01
 """Noise of records that are made from the truth, if none is stated."""
 CONVERGED = 1e-3
 """Remaining step of a converged fit, in standard errors by its residuals, and its square by the noise."""
 SHARE = 1e-4
 """Exponents below this are 0."""
-TESTED = 64
-"""Most records whose residuals are tested."""
 UNEXPLAINED = 1e-3
 """Share of fits to a right model whose residuals are larger than those that count as consistent with the noise."""
 
@@ -123,7 +117,8 @@ class Model:
 
     def scaled(self, theta: np.ndarray) -> Model:
         """Return the model with the sizes in ``theta (p,)`` as scales, where they change the motion noticeably."""
-        is_large = np.abs(theta) > NOTICEABLE * np.abs(self.scale)
+        # least size of an unknown without a logarithm, in units of its scale, that becomes its scale
+        is_large = np.abs(theta) > 0.01 * np.abs(self.scale)
         return dataclasses.replace(self, scale=np.where(self.scale * is_large, theta, self.scale))
 
     def with_scales(self, start: np.ndarray) -> Model:
@@ -277,7 +272,8 @@ class Fitting:
         parts = [(self.model.measurements(path) - data) / self.noise]
         if self.shooting == "multiple":
             gaps = (states[-1, :, :-1] - np.moveaxis(later, 0, 1)).reshape(-1, batch)
-            parts.append(GAP_WEIGHT * gaps / self.noise)
+            # weight of a gap between windows of multiple shooting, relative to the weight of a measurement
+            parts.append(100.0 * gaps / self.noise)
         return np.concatenate(parts)
 
     def jacobians(self, points: np.ndarray, data: np.ndarray) -> np.ndarray:
@@ -495,7 +491,8 @@ def _estimates(fit: Fit, known: Information, start: np.ndarray, own: Mapping[str
         "unnoticed": [],
         "errors": [],
     }
-    finite = np.flatnonzero(fit.is_finite)[:TESTED].tolist()
+    # most records whose residuals are tested
+    finite = np.flatnonzero(fit.is_finite)[:64].tolist()
     if not finite or finite[0]:
         return result
     # the effects of missing terms at one fit serve all records, which have the same truth

@@ -15,15 +15,14 @@ import pandas as pd
 
 from bench.errors import UserError
 
-SLIP = 0.1
-"""Distance over which the force of hysteresis rises, relative to the largest distance from 0."""
 OFF = 0.01
 """Share of a step by which a time may differ from a multiple of it."""
 
 
 def hysteresis(x: np.ndarray) -> np.ndarray:
     """Return the force of a spring with dry friction in series along positions ``(n,)``, at most 1."""
-    slips = np.diff(x) / max(SLIP * float(np.abs(x).max()), 1e-300)
+    # distance over which the force of hysteresis rises, relative to the largest distance from 0
+    slips = np.diff(x) / max(0.1 * float(np.abs(x).max()), 1e-300)
     return np.array([*itertools.accumulate(slips, lambda force, by: np.clip(force + by, -1.0, 1.0), initial=0.0)])
 
 

@@ -26,8 +26,6 @@ PATH = ("iteration", "cost", "rollouts", "gradients", "s")
 """What is recorded along a path."""
 MAX_POINTS = 300
 """Most points of a path to store, about; they are denser in early iterations."""
-MAX_NEWTON_DIM = 1000
-"""Largest dimension of theta for which Newton's method computes the optimum."""
 
 
 def objective(problem: Problem, theta: np.ndarray, scored: np.ndarray) -> float:
@@ -146,7 +144,8 @@ def known_optimum(cell: Cell, problem: Problem, session: Session) -> tuple[float
         known = cell.scene.optimum(cell.contact, cell.integrator)
         if known is not None:
             return known
-    if problem.dim > MAX_NEWTON_DIM or not problem.program.continuous or "grad" not in cell.backend.provides:
+    # largest dimension of theta for which Newton's method computes the optimum
+    if problem.dim > 1000 or not problem.program.continuous or "grad" not in cell.backend.provides:
         return np.nan, "unknown"
     found = stored_in(session, f"optimum_{cell.program_key}.json", lambda: _newton(problem))
     return found["cost"], found["how"]

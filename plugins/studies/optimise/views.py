@@ -26,14 +26,10 @@ from .. import PARTS
 
 TARGETS = (10.0, 100.0, 1000.0)
 """Target regrets: the first regret divided by each of these factors."""
-MIN_SEEDS_TO_SPLIT = 4
-"""Fewest seeds to split: some choose the tunings, the others score."""
 ROUNDING = 1e-12
 """Smallest regret, as a share of the first regret: a smaller regret is rounding."""
 
 
-STEPS = 40
-"""Number of points of a drawn curve."""
 METHOD, PROBLEM = text("method"), text("problem")
 REACHED = interval("reached", label="targets reached", format="percent", log=False)
 SCORE = interval("score", digits=3, log=False)
@@ -83,7 +79,8 @@ class RunSet:
         """The seeds that choose the tunings and do not score: the first third. Empty without tunings or with few seeds."""
         seeds = sorted(int(seed) for seed in self.rows["seed"].unique())
         several = (self.rows.groupby(["problem", "method"])["tuning"].nunique() > 1).any()
-        return tuple(seeds[: math.ceil(len(seeds) / 3)]) if several and len(seeds) >= MIN_SEEDS_TO_SPLIT else ()
+        # fewest seeds to split: some choose the tunings, the others score
+        return tuple(seeds[: math.ceil(len(seeds) / 3)]) if several and len(seeds) >= 4 else ()
 
     @cached_property
     def best_tunings(self) -> dict[tuple[str, str], str]:
@@ -359,7 +356,8 @@ def charts(runs: RunSet) -> list[Chart]:
     # the weights of a method's searches add up to 1, in equal parts for its problems and targets
     weight = 1.0 / times.groupby(["problem", "method", "target"])["spent"].transform("size")
     weight = (weight / weight.groupby(times["method"]).transform("sum")).where(times["reached"], 0.0)
-    grid = np.geomspace(finite.min() / 1.5, finite.max() * 1.2, STEPS)
+    # number of points of a drawn curve
+    grid = np.geomspace(finite.min() / 1.5, finite.max() * 1.2, 40)
     shares = {
         method: [float(part[times["spent"][part.index] <= x].sum()) for x in grid]
         for method, part in weight.groupby(times["method"], sort=False)

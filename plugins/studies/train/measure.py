@@ -32,8 +32,6 @@ MEANS = frozenset({"loss", "reward", "value_loss", "cut", "used", "contacts", "s
 """Quantities whose mean an entry of a stored log has; it has the largest value of the others, so that no peak is lost."""
 LENGTHS = (1e-6, 1e-7, 1e-8)
 """Changes of parameters in central differences in float64, short enough for episodes with contact."""
-SETTLED = 0.01
-"""Largest relative distance of the three differences from each other for a slope that is known."""
 
 
 def measure(cell: Cell, session: Session, settings: Train) -> dict[str, Any]:
@@ -141,7 +139,8 @@ def slope_errors(exact: Training, state: Any) -> list[float]:
         slopes = np.array(
             [(exact.loss(state, h * direction) - exact.loss(state, -h * direction)) / (2 * h) for h in LENGTHS]
         )
-        is_known = np.ptp(slopes) < SETTLED * abs(slopes[1])
+        # largest relative distance of the three differences from each other for a slope that is known
+        is_known = np.ptp(slopes) < 0.01 * abs(slopes[1])
         ratios.append(float(gradient @ direction / slopes[1]) if is_known else math.nan)
     common = abs(np.nanmedian(ratios)) if np.isfinite(ratios).any() else math.nan
     return [abs(ratio / common - 1.0) for ratio in ratios]

@@ -23,8 +23,6 @@ from bench.report.views import arrange, attempted
 from .. import PARTS
 from .verdicts import RULES, judge, series
 
-LEVEL = 0.05
-"""Level of the test of a difference between two groups of runs."""
 MIN_SEEDS = 5
 """Fewest seeds for an interval: a resample cannot leave the range of its values, which covers too little for fewer."""
 OF_WINDOWS = ("window_bias", "window_bias_low", "window_bias_high", "window_gradient")
@@ -201,7 +199,8 @@ def is_lower(returns: np.ndarray, others: np.ndarray) -> bool:
 
     test = mannwhitneyu(others, returns)
     is_above = test.statistic > len(returns) * len(others) / 2
-    return bool(len(returns) >= MIN_SEEDS and test.pvalue < LEVEL and is_above)
+    # level of the test of a difference between two groups of runs
+    return bool(len(returns) >= MIN_SEEDS and test.pvalue < 0.05 and is_above)
 
 
 def middle_with_interval(name: str, values: np.ndarray) -> dict[str, float]:
