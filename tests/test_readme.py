@@ -22,8 +22,7 @@ DOCS = {path.name: path.read_text() for path in sorted((ROOT / "docs").glob("*.m
 README = (ROOT / "README.md").read_text()
 PAGES = [
     ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md",
-    *(ROOT / folder / "README.md" for folder in ("plugins", "conf", "results")), *(ROOT / "docs" / name for name in DOCS),
-    *(ROOT / "examples" / folder / "README.md" for folder in ("atlas", "cost_of_error")),
+    *(ROOT / folder / "README.md" for folder in ("plugins", "conf", "results", "examples/atlas")), *(ROOT / "docs" / name for name in DOCS),
 ]  # fmt: skip
 EXAMPLES = dict(re.findall(r"```python\n# (\S+\.py)\n(.*?)```", DOCS["extending.md"] + DOCS["training.md"], re.DOTALL))
 SOFT = "# @package _global_\nscenes: [heaviside]\nbackends: [numpy]\n"

@@ -28,7 +28,7 @@ from bench.simulator import imports
 
 FOLDER = Path(__file__).parent
 ROOT, REPORTS = FOLDER.parents[1], FOLDER / "reports"
-PAGE = Path(__file__).parent / "README.md"
+PAGE = FOLDER / "README.md"
 LIMIT_S = 900.0
 """Time allowed for one simulator; most of it compiles."""
 ALIKE = 1e-3
