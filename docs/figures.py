@@ -284,9 +284,6 @@ FIGURES: dict[str, str | Callable[[], str]] = {
     "quadruped-sides": sides_right,
     "quadruped-jumps": jumps_at_switches,
     "quadruped-engines": engines_agree,
-    "engines-table": lambda: block(
-        (STANDARD / "engines_table" / "engines.md").read_text().split("\n\n")[1].split("\n")
-    ),
     "dose-pairs": lambda: dose_classes({name: name for name in UPDATES}),
     "dose-runs": dose_runs,
     "dose-unreached": dose_unreached,

@@ -32,6 +32,7 @@ PAGES: Mapping[str, str] = {
     "contributing": "CONTRIBUTING.md",
     "changelog": "CHANGELOG.md",
     "cost-of-error": "examples/cost_of_error/README.md",
+    "atlas": "examples/atlas/README.md",
     **{path.stem: f"docs/{path.name}" for path in sorted(DOCS.glob("*.md"))},
 }
 """The site's page of each document, and its path in the repository."""
@@ -39,7 +40,6 @@ SECTIONS: Mapping[str, Sequence[str]] = {
     "start": ("reading-results", "python"),
     "trust": ("gradcheck", "examine", "watch", "conformance", "atlas"),
     "results": (
-        "answers",
         "experiment/*",
         "estimators",
         "methods",
@@ -63,7 +63,6 @@ SECTIONS: Mapping[str, Sequence[str]] = {
         "peers",
         "validation",
         "sources",
-        "upstream",
         "changelog",
     ),
 }
@@ -174,7 +173,7 @@ def home_page() -> str:
         "- [Reference](reference.md): commands, columns, Python interface, validation",
     ]
     index = (ROOT / PAGES["results"]).read_text().partition("\n## ")[0]
-    questions = [line for line in index.splitlines() if line.startswith("|")]
+    questions = [line.replace("](#", "](results.md#") for line in index.splitlines() if line.startswith("|")]
     return "\n".join(
         [localise(opening, Path("README.md")), "", *lines, "", "## Results by question", "", *questions, ""]
     )

@@ -22,7 +22,7 @@ DOCS = {path.name: path.read_text() for path in sorted((ROOT / "docs").glob("*.m
 README = (ROOT / "README.md").read_text()
 PAGES = [
     ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md",
-    *(ROOT / folder / "README.md" for folder in ("plugins", "conf", "results")), *(ROOT / "docs" / name for name in DOCS),
+    *(ROOT / folder / "README.md" for folder in ("plugins", "conf", "results", "examples/atlas")), *(ROOT / "docs" / name for name in DOCS),
 ]  # fmt: skip
 EXAMPLES = dict(re.findall(r"```python\n# (\S+\.py)\n(.*?)```", DOCS["extending.md"] + DOCS["training.md"], re.DOTALL))
 SOFT = "# @package _global_\nscenes: [heaviside]\nbackends: [numpy]\n"
@@ -99,7 +99,7 @@ def test_every_scene_and_experiment_is_described():
     assert registry.entries()["scenes"].keys() <= set(
         re.findall(r"`(\w+)`", DOCS["experiments.md"].partition("\n## Scenes\n")[2])
     )
-    assert set(config.experiments()) <= set(re.findall(r"^(?:### |- `)([\w/]+)", DOCS["answers.md"], re.MULTILINE))
+    assert set(config.experiments()) <= set(re.findall(r"^(?:### |- `)([\w/]+)", DOCS["results.md"], re.MULTILINE))
 
 
 def test_every_command_and_setting_is_described():

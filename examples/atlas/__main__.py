@@ -3,7 +3,7 @@
 Each other file here is a simulator, with its facts in ``about``: the package, the environment that it shares and what pip
 installs into it, the settings of ``examine``, the answers that the truth demands, and how ``truth()`` knows the derivative.
 ``install`` makes the environments like those of engines, ``examine`` writes a JSON per simulator into ``reports``,
-``page`` writes ``docs/atlas.md`` from them. The environment ``bench`` is the Python that runs this.
+``page`` writes ``README.md`` here from them. The environment ``bench`` is the Python that runs this.
 """
 
 import ast
@@ -28,7 +28,7 @@ from bench.simulator import imports
 
 FOLDER = Path(__file__).parent
 ROOT, REPORTS = FOLDER.parents[1], FOLDER / "reports"
-PAGE = ROOT / "docs" / "atlas.md"
+PAGE = FOLDER / "README.md"
 LIMIT_S = 900.0
 """Time allowed for one simulator; most of it compiles."""
 ALIKE = 1e-3
@@ -40,7 +40,7 @@ INTRODUCTION = """\
 # Simulators that others wrote
 
 `bench.examine` on {count} packages, used as their documentation shows or as one writes it first, beside the truth, which `truth()` in the
-simulator's file in `examples/atlas` computes: {score}.
+simulator's file computes: {score}.
 
     python -m examples.atlas install NAME    # into a Python that it shares with others of its kind
     python -m examples.atlas examine NAME    # or without names: all, then `page` writes this page
@@ -158,7 +158,7 @@ def page():
         off = f"{number(100 * row['off'], 1)}%" if row.get("off") is not None else "-"
         cells = [
             f"{each['package']} {row.get('version', '')}",
-            f"[{each['what']}](../examples/atlas/{each['name']}.py)",
+            f"[{each['what']}]({each['name']}.py)",
         ]
         cells += [
             ", ".join(filter(None, said)),

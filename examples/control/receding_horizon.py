@@ -155,22 +155,19 @@ def costs(sigma, seeds):
     }
 
 
-def interval(values, digits=0):
+def interval(values):
     """Return the mean with its 95% interval by Student's t."""
     half = student.ppf(0.975, len(values) - 1) * values.std(ddof=1) / len(values) ** 0.5
-    mean, low, high = (f"{x:,.{digits}f}" for x in (values.mean(), values.mean() - half, values.mean() + half))
+    mean, low, high = (f"{x:,.0f}" for x in (values.mean(), values.mean() - half, values.mean() + half))
     return f"{mean} [{low}, {high}]"
 
 
 def table(sigmas=SIGMAS, seeds=SEEDS):
-    """Return a table in Markdown: mean costs, and by how much they exceed the cost of the plan with gains."""
-    text = "| sigma | law | cost | above the plan with gains |\n|--:|---|--:|--:|\n"
-    for sigma in sigmas:
-        by_law = costs(sigma, range(seeds))
-        least = by_law["plan made once, with gains"]
-        for name, values in by_law.items():
-            above = "" if values is least else interval(values - least, 1)
-            text += f"| {sigma} | {name} | {interval(values)} | {above} |\n"
+    """Return a table in Markdown: the mean cost of each law, with a column per sigma."""
+    by_sigma = [costs(sigma, range(seeds)) for sigma in sigmas]
+    text = f"| law | {' | '.join(f'cost at sigma {sigma}' for sigma in sigmas)} |\n|---|{'--:|' * len(sigmas)}\n"
+    for name in by_sigma[0]:
+        text += f"| {name} | {' | '.join(interval(by_law[name]) for by_law in by_sigma)} |\n"
     return text
 
 

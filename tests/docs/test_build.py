@@ -29,10 +29,10 @@ def test_answers_stand_under_their_question_and_experiments_without_rows_last(tm
     (tmp_path / "quick" / "answer.json").write_text(json.dumps(record))
     monkeypatch.setattr(config, "experiments", lambda *_: ["twins", "quick"])
     index = tmp_path / "results.md"
-    index.write_text("| question | experiments |\n|---|---|\n| Does it work? | [all](answers.md#quick) |\n")
-    text = build.answers_page(index, tmp_path)
+    index.write_text("| question | experiments |\n|---|---|\n| Does it work? | [all](#quick) |\n")
+    text = build.results_page(index, tmp_path)
     assert text.endswith(
-        "\n## Without stored results\n\n- `twins`: How far are the engines' gradients from the scenes' own?\n"
+        "\n## Without stored results\n\n- `twins`: How far are the engines' gradients from the scenes' own?\n<!-- end of answers -->"
     )
     assert (
         "## Does it work?\n\n### quick\n\n![quick](quick/chart.png)\n\nFirst &lt;b&gt;. Second. [Data](quick)\n\n"

@@ -9,7 +9,7 @@ from docs.results import PAPER
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = {path: (ROOT / path).read_text() for path in website.PAGES.values()}
-FREE = ("CHANGELOG.md", "CONTRIBUTING.md", "docs/answers.md", "docs/columns.md", "docs/results.md", "docs/sources.md")
+FREE = ("CHANGELOG.md", "CONTRIBUTING.md", "docs/columns.md", "docs/results.md", "docs/sources.md")
 """Documents without figures of their own: history, rules, and pages that are generated."""
 NUMBER = re.compile(r"(?<![\w.,=/-])(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e-?\d+)?%?(?![\w-]|\.\d)")
 PLAIN = re.compile(r"\d{1,2}|10*(?:,000)*%?|(?:19|20)\d\d|95%|2\.0|3\.11")
