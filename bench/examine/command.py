@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from bench.errors import UserError, local_path, unknown
+from bench.errors import StorageError, UserError, local_path, needing_sweeps, unknown
 from bench.examine import UPDATE
+from bench.examine.baseline import read_baseline
 from bench.examine.examination import KEY, examine
 from bench.examine.report import Report
+from bench.run.files import make_directory
 from bench.simulator import imports
 from bench.simulator.simulator import LIBRARIES
 
@@ -43,8 +45,7 @@ def run(words: Sequence[str]) -> Report:
     for key in settings:
         if key not in SETTINGS:
             raise unknown("setting of examine", key, SETTINGS)
-        if key in FILES:
-            local_path(key, settings[key])
+    _check_files(settings)
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(COMPILED))  # which JAX reads when it is imported
     report = _examined(names[0], settings, QUIET not in words)
     if "baseline" in settings:
@@ -55,6 +56,20 @@ def run(words: Sequence[str]) -> Report:
         for path in report.save(settings["save"]):
             print(f"  {path}")
     return report
+
+
+def _check_files(settings: Mapping[str, str]) -> None:
+    """Raise the error of a file that cannot be read or written, before an examination that may take minutes."""
+    if "baseline" in settings:
+        read_baseline(local_path("baseline", settings["baseline"]))
+    if "save" in settings:
+        with needing_sweeps("save"):
+            import bench.examine.files  # noqa: F401
+
+        directory = local_path("save", settings["save"])
+        make_directory(directory)
+        if not os.access(directory, os.W_OK):
+            raise StorageError(f"save={directory} cannot be written: permission denied")
 
 
 def main(words: Sequence[str]) -> int:

@@ -15,9 +15,9 @@ import pytest
 import bench
 from bench import cli
 from bench.errors import UserError
-from bench.examine import smoothing, text
+from bench.examine import command, smoothing, text
 from bench.examine.lines import Break, LineScan, scan
-from bench.simulator import simulator
+from bench.simulator import imports, simulator
 from bench.simulator.simulator import Simulator
 from bench.simulator.tree import ParameterTree
 
@@ -373,6 +373,14 @@ def mysim(tmp_path):
 def test_command_says_what_is_wrong_with_its_words(mysim, capsys, words, said):
     assert cli.main(["examine", *(word.format(mysim) for word in words)]) == 2
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("file", ["save", "baseline"])
+def test_a_file_that_cannot_be_used_is_refused_before_the_examination(mysim, file):
+    mysim.write_text(f"{mysim.read_text()}calls = []\ndef counted(x): calls.append(x); return cost(x)\n")
+    with pytest.raises(UserError, match=r"mysim\.py"):
+        command.run([f"{mysim}:counted", f"{file}={mysim}", "calls=20", "--quiet"])
+    assert not imports.load_module(str(mysim)).calls
 
 
 def test_own_arithmetic_does_not_warn_and_the_cost_still_does():
