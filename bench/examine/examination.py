@@ -16,10 +16,19 @@ import numpy as np
 from bench.errors import UserError, unknown
 from bench.examine import diagnosis
 from bench.examine.findings import RELATIVE, GroupSize, Setup, Spent
-from bench.examine.lines import HALVINGS, PLACES, POINTS, REACH, LineScan, scan
+from bench.examine.lines import HALVINGS, PLACES, POINTS, REACH, SIDES, LineScan, scan
 from bench.examine.means import OF_A_DRAW, Mean, compare_means
 from bench.examine.report import Report
-from bench.examine.smoothing import FEWEST, OWN_PAIRS, PAIRS, Smoothed, directions, largest_unseen, measure_smoothed
+from bench.examine.smoothing import (
+    FEWEST,
+    FIRM,
+    OWN_PAIRS,
+    PAIRS,
+    Smoothed,
+    directions,
+    largest_unseen,
+    measure_smoothed,
+)
 from bench.examine.stages import GradientStages
 from bench.gradient import Check
 from bench.gradient.rules import RULES, SUSPICIOUS
@@ -44,6 +53,8 @@ OWN_LEVELS, OWN_SHARE, OWN_DRAWS = (0.01, 0.03, 0.1, 0.3, 1.0), 0.6, 64
 its own standard deviation in this number of draws."""
 EARLY_SHARE = 0.5
 """Share of the remaining budget for the lines of a gradient that adaptive steps may explain."""
+SIDES_OF_A_BREAK = 2 * SIDES
+"""Costs that confirm a break."""
 FEWEST_POINTS = 17
 """Fewest points of a line scan."""
 HELD = 20_000_000
@@ -290,7 +301,15 @@ class _Examination:
                 *(f"the cost raised {n} times: {text}" for text, n in list(simulator.raised.items())[:3]),
             ],
             left_out=self.left_out,
+            enough=self._enough(),
         )  # fmt: skip
+
+    def _enough(self) -> tuple[float, float]:
+        """Return the numbers of costs and gradients with which nothing is left out, as far as is known."""
+        n_sigmas, (costs, gradients) = len(self.setup.levels) or bool(self.simulator.noise), self.stages.enough()
+        lines = len(directions(2, self.setup.scale, 0))
+        costs += 2 * lines * (POINTS + PLACES * (2 * HALVINGS + SIDES_OF_A_BREAK)) + n_sigmas * 2 * FIRM
+        return costs, gradients + (lines * sum(NODES) + n_sigmas * 2 * FIRM) * self.simulator.has_gradient
 
     def _group_sizes(self) -> dict[str, GroupSize]:
         """Return, by name of a group of numbers, what errors of its numbers do to the slope along its direction."""
@@ -362,7 +381,7 @@ class _Examination:
     def _effort(room: float) -> tuple[int, int, int]:
         """Return points, halvings and places of a line scan with at most ``room`` costs; no points if these are too few."""
         for most, halvings in LINE_EFFORTS:
-            points = int(min(POINTS, room - most * (2 * halvings + 8)))
+            points = int(min(POINTS, room - most * (2 * halvings + SIDES_OF_A_BREAK)))
             if points >= FEWEST_POINTS:
                 return points, halvings, most
         return 0, 0, 0

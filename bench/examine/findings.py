@@ -17,6 +17,7 @@ from bench.examine.lines import ALIKE, LineScan
 from bench.examine.means import OF_A_DRAW, Mean
 from bench.examine.smoothing import TARGET_ERROR, Method, Smoothed
 from bench.examine.stages import Repeats, recaused
+from bench.examine.subspace import MOST
 from bench.gradient import FAULTS, TRUSTED, Check, Part, Sample, rules
 from bench.gradient.direction import CHANCE, resolution
 from bench.gradient.rules import EXCUSABLE, RULES, STATUS, SUSPICIOUS, UNEQUAL
@@ -179,8 +180,8 @@ class Findings:
     """Whether the check has at most three steps per component."""
     is_complete: bool
     """Whether every chosen component and group was checked."""
-    located: dict[str, str]
-    """By name of a wrong group: the numbers that cause its error."""
+    located: dict[str, tuple[int, int]]
+    """By name of a wrong group: the first of the numbers that cause its error, and the last + 1."""
     groups: dict[str, GroupSize]
     """By name of a group of numbers that move along one random direction: its size."""
     more: Sequence[Check]
@@ -206,6 +207,8 @@ class Findings:
     notes: Sequence[str]
     left_out: Sequence[str]
     """The parts of the examination that the budget did not allow."""
+    enough: tuple[float, float]
+    """Costs and gradients with which nothing is left out."""
     expect: str = ""
     """The known cause with which the report passes."""
     command: str = ""
@@ -456,8 +459,30 @@ class Findings:
         check = self.wrong_checks[0]
         located = [part for part in check.parts if part.name in self.located]
         inside = [part for part in check.worst_parts if part.component is not None]
-        exact = [part for part in inside if self.label(part) in self.located.values()]
+        exact = [part for part in inside if part.component in self._located_numbers]
         return exact or [*located, *inside] or list(check.worst_parts)
+
+    @property
+    def suspects(self) -> list[str]:
+        """The inputs of :attr:`culprits`, by names that a user has: of one number of a large array the array's."""
+        names: list[str] = []
+        for part in self.culprits:
+            index = part.component
+            first, last = self.located.get(part.name, (0, 0) if index is None else (index, index + 1))
+            leaves = self.layout.inside(first, last)
+            is_entry = last - first == 1 and (first in self._located_numbers or leaves[0].size <= MOST)
+            names += [self.layout.name(first)] if is_entry else [leaf.name for leaf in leaves]
+        return list(dict.fromkeys(names))
+
+    @property
+    def _located_numbers(self) -> set[int]:
+        return {first for first, last in self.located.values() if last - first == 1}
+
+    @property
+    def can_refine(self) -> bool:
+        """Whether a refined cost can show that the error is one of the discretisation."""
+        explained = self.explained
+        return bool(explained.smooth_parts or explained.steps) or may_be_adaptive(self.check)
 
     @property
     def _failed_numbers(self) -> str:
@@ -468,7 +493,9 @@ class Findings:
 
     def numbers(self, part: Part) -> str:
         """Return a part's numbers: the program's, the difference, and how far they are apart; at a kink both slopes."""
-        name = f"{self.located[part.name]}, along a random direction" if part.name in self.located else self.label(part)
+        name = self.label(part)
+        if part.name in self.located:
+            name = f"{self.layout.block(*self.located[part.name])}, along a random direction"
         if part.verdict == "jump":
             return name
         if part.verdict == "kink":

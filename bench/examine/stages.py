@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from bench.examine.few import ROUNDS, FewSteps, is_nothing
-from bench.examine.subspace import Group, Subspace, choose, locate
+from bench.examine.subspace import Group, Subspace, choose, count_of, locate
 from bench.gradient import EPS, FAULTS, TRUSTED, Check, Options, Part, Sample, check, step_sizes
 from bench.gradient.check import NOTHING, cause_of
 from bench.gradient.roughness import FINE
@@ -103,8 +103,8 @@ class GradientStages:
         """Whether the gradient at theta raised an exception."""
         self.more: list[Check] = []
         """Checks under other draws of the simulator's own noise."""
-        self.located: dict[str, str] = {}
-        """By name of a wrong group: the numbers that cause its error."""
+        self.located: dict[str, tuple[int, int]] = {}
+        """By name of a wrong group: the first of the numbers that cause its error, and the last + 1."""
         self.groups: list[Group] = []
         """The groups of a large theta that are checked along one direction each."""
         self.left_out: list[str] = []
@@ -316,6 +316,14 @@ class GradientStages:
         gradients = 0 if self.gradient is None else 3 + options.draws * (3 if wrong else 1)
         return costs, gradients
 
+    def enough(self) -> tuple[float, float]:
+        """Return the numbers of costs and gradients with which every stage finishes, within its share of them."""
+        size, share = count_of(self.theta.size), BEFORE_NOISE if self._has_noise else SHARE
+        last = self._cost_of(self._options(size, MOST if self.theta.size <= MANY else FEW), size)
+        more = self._cost_of(self._options(size), size)
+        costs, gradients = (before + one / share for before, one in zip(more, last, strict=True))
+        return costs + 2 * len(ROUNDS) * size + NOISE_POINTS, gradients + NOISE_POINTS
+
     def _check_in_stages(self, space: Subspace, explain: Callable[[Check], None]) -> None:
         if not self._run_stage("more steps", space, self._options(space.size), SHARE):
             return
@@ -370,7 +378,7 @@ class GradientStages:
             for part in self.check.parts:
                 if part.name in groups and part.verdict in FAULTS and math.isfinite(part.program):
                     first, last = locate(groups[part.name], self.theta, self.gradient, self.costs, part)
-                    self.located[part.name] = self.layout.block(first, last)
+                    self.located[part.name] = first, last
                     if last - first == 1 and first not in space.components:
                         self._check_number(first, part.verdict)
 

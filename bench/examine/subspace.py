@@ -82,6 +82,11 @@ class Subspace:
         return replace(part, component=None, name=self.groups[part.component - len(self.components)].name)
 
 
+def count_of(dim: int) -> int:
+    """Return the largest number of coordinates for a theta of ``dim`` numbers."""
+    return dim if dim <= MOST else MOST + GROUPS
+
+
 def choose(
     layout: ParameterTree, scale: np.ndarray, gradient: np.ndarray | None, seed: int, most: int = MOST
 ) -> Subspace:

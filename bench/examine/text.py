@@ -7,10 +7,9 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from bench.examine.findings import FAILED, RIGHT, SEEN, Findings, as_text, shortened
+from bench.examine.findings import FAILED, NONE, RIGHT, SEEN, Findings, as_text, shortened
 from bench.examine.lines import REACH
 from bench.examine.smoothing import PAIRS
-from bench.examine.subspace import GROUPS, MOST
 from bench.gradient import FAULTS
 from bench.gradient.rules import RULES
 from bench.report.text import counted, duration, number
@@ -106,26 +105,41 @@ def warnings(report: Findings) -> list[str]:
 
 def advice(report: Findings) -> str:
     """Return the next step, and on lines of their own the commands with the settings that take it."""
-    cause, spent, explained = report.cause, report.spent, report.explained
+    cause, explained = report.cause, report.explained
     has_refined = bool(explained.gaps)
     given = {
         "{more}": not report.left_out and all(one.pairs >= PAIRS for one in report.smoothed),
         "sigma": not report.gradient or bool(report.setup.levels),
         "horizons": bool(explained.growth) or not report.takes_steps,
-        "refined": has_refined or (cause == "undecided" and not report.wrong_checks),
+        "refined": has_refined or not report.can_refine,
         "expect": cause == "adaptive" and not has_refined,
     }
-    # two costs per component or group, and the repeated calls; where no cost was timed, the first calls bound its time
-    n_costs = 2 * min(report.theta.size, MOST + GROUPS) + 7
-    each = spent.cost_s if math.isfinite(spent.cost_s) else spent.compile_s
-    more = f"budget={max(2 * spent.budget, 60.0, n_costs * each):.0f}s"
-    more = f"calls={int(2 * spent.calls)}" if math.isfinite(spent.calls) else more
-    settings = [s.format(more=more, cause=cause) for s in RULES[cause].settings if not given.get(s.partition("=")[0])]
-    names = ", ".join(report.located.get(part.name, report.label(part)) for part in report.culprits[:3])
-    prose = RULES[cause].advice.format(names=names or "the cost")
+    wanted = RULES[cause].settings
+    wanted = (*wanted, "{more}") if report.left_out and report.derivative in (RIGHT, NONE) else wanted
+    settings = [
+        s.format(more=_more(report), cause=cause) for s in dict.fromkeys(wanted) if not given.get(s.partition("=")[0])
+    ]
+    prose = RULES[cause].advice.format(names=", ".join(report.suspects[:3]) or "the cost")
     if not report.command:
         return ", or ".join(filter(None, [prose, *settings]))
     return "\n  ".join([prose or "run" * bool(settings), *(again(report, setting) for setting in settings)])
+
+
+def _more(report: Findings) -> str:
+    """Return the setting of a budget with which nothing is left out, at least twice the given one."""
+    spent, (costs, gradients) = report.spent, report.enough
+    if math.isfinite(spent.calls):
+        return f"calls={rounded_up(max(2 * spent.calls, costs + gradients))}"
+    # where no cost was timed, the first calls bound its time
+    each = spent.cost_s if math.isfinite(spent.cost_s) else spent.compile_s
+    slope = spent.gradient_s if math.isfinite(spent.gradient_s) else 4 * each
+    return f"budget={rounded_up(max(2 * spent.budget, 60.0, costs * each + gradients * slope))}s"
+
+
+def rounded_up(value: float) -> int:
+    """Return the next whole number of at most two digits and zeros."""
+    unit = 10 ** max(len(str(math.ceil(value))) - 2, 0)
+    return math.ceil(value / unit) * unit
 
 
 def again(report: Findings, setting: str) -> str:

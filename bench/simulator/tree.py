@@ -90,15 +90,21 @@ class ParameterTree:
             bad = self.name(int(np.argmin(np.isfinite(self.vector))))
             raise UserError(f"{bad} is not finite: give a theta of finite numbers")
 
+    def inside(self, first: int, last: int) -> list[Leaf]:
+        """Return the arrays with entries from ``first`` up to ``last``, by the entries' indices in the vector."""
+        return [leaf for leaf in self.leaves if leaf.start < last and leaf.start + leaf.size > first]
+
     def name(self, index: int) -> str:
         """Return the name of an entry by its index in the vector, ``gains[3]``."""
-        leaf = next(leaf for leaf in self.leaves if index < leaf.start + leaf.size)
+        (leaf,) = self.inside(index, index + 1)
         return leaf.entry(index - leaf.start)
 
     def block(self, first: int, last: int) -> str:
         """Return the name of the entries from ``first`` up to ``last``: ``gains``, ``gains[0] to gains[3]``, ``mass to gains``."""
-        inside = [leaf for leaf in self.leaves if leaf.start < last and leaf.start + leaf.size > first]
-        names = [leaf.block(max(first - leaf.start, 0), min(last - leaf.start, leaf.size)) for leaf in inside]
+        names = [
+            leaf.block(max(first - leaf.start, 0), min(last - leaf.start, leaf.size))
+            for leaf in self.inside(first, last)
+        ]
         return names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
 
     def match(self, name: str) -> list[int]:

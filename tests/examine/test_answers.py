@@ -68,3 +68,35 @@ def test_no_bound_on_the_bias_is_tighter_than_its_draws_support(pairs):
     report = examine(lambda x: float(x[0]), [1.0], grad=lambda x: [1.0], sigma=0.1, calls=4 * pairs + 2000)
     bound = float(re.search(r"below ([\d.]+)%", report.noise_answer)[1])
     assert bound > 100.0 * 3.0 / (2.0 * report.smoothed[0].pairs), str(report)
+
+
+def test_the_advice_names_what_a_user_can_follow():
+    """An entry of a large array has no name in a program, nor has a random direction."""
+    theta = {"mass": 1.5, "w1": np.linspace(0.1, 0.9, 24).reshape(6, 4)}
+
+    def quadratic(x):
+        return float(x["mass"] ** 2 + (x["w1"] ** 3).sum())
+
+    def off(x):
+        return {"mass": 2 * x["mass"], "w1": 3 * x["w1"] ** 2 * np.linspace(0.5, 0.9, 24).reshape(6, 4)}
+
+    assert "follow w1 through" in examine(quadratic, theta, grad=off).advice
+    single = {"mass": 1.5, "gains": np.array([0.3, 0.4])}
+
+    def scaled(x):
+        return {"mass": 2 * x["mass"], "gains": np.array([1.0, 2.0])}
+
+    report = examine(lambda x: float(x["mass"] ** 2 + x["gains"].sum()), single, grad=scaled)
+    assert "follow gains[1] through" in report.advice
+
+
+@pytest.mark.parametrize(("factor", "is_shown"), [(0.6, False), (0.99, True)])
+def test_a_refined_cost_is_asked_for_where_it_can_decide(factor, is_shown):
+    """Smooth costs with a fixed program are compared with a refined cost only where the error is as small as a discretisation's."""
+
+    def off(x):
+        return [2 * x[0], 3.0 * (factor + 0.001 * x[0])]
+
+    report = examine(cost, THETA, grad=off)
+    assert report.status == 1
+    assert ("refined=COST" in report.advice) == is_shown

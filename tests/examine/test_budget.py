@@ -39,7 +39,22 @@ def test_fewer_calls_than_components_decide_nothing():
         report = examine(cost, THETA, grad=grad, calls=calls)
         assert (report.status, report.cause) == (3, "undecided"), calls
         assert re.search(r"[0-2] of 3 components", str(report))
-    assert "calls=14" in report.advice
+
+
+@pytest.mark.parametrize(
+    ("size", "settings"), [(2, {}), (16, {}), (40, {}), (2, {"sigma": 0.1}), (5, {"sigma": [0.01, 0.1]})]
+)
+def test_with_the_proposed_calls_nothing_is_left_out(size, settings):
+    def examined(calls):
+        return examine(
+            lambda x: float(np.sin(x).sum()), np.linspace(0.3, 1.2, size), grad=np.cos, calls=calls, **settings
+        )
+
+    for calls in (5, 40, 700):
+        report = examined(calls)
+        assert report.left_out
+        (proposed,) = re.findall(r"calls=(\d+)", report.advice)
+        assert not examined(int(proposed)).left_out
 
 
 @pytest.mark.parametrize(("budget", "size"), [(1, 2), (20, 100)])
