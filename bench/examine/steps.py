@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import linecache
 import sys
+from collections import Counter
 from functools import cache
 from pathlib import Path
 from types import FrameType
@@ -18,8 +19,6 @@ import numpy as np
 
 from bench.simulator.simulator import Simulator
 
-Loops = dict[tuple[str, int], set[int]]
-"""By file and line of a loop: the numbers of iterations of its runs."""
 SKIPPED = tuple(
     f"/{name}/" for name in ("jax", "jaxlib", "torch", "numpy", "bench/model", "bench/gradient", "bench/examine")
 )
@@ -35,51 +34,45 @@ def changing_loop(simulator: Simulator, thetas: np.ndarray, w: np.ndarray | None
     place = _loop_of_jax(simulator, thetas[:, 0], w)
     if place or simulator.library == "jax":
         return place
-    runs = [traced_loops(simulator, theta, w) for theta in thetas.T]
+    runs = [rounds_of_loops(simulator, theta, w) for theta in thetas.T]
     for file, line in sorted(set.intersection(*map(set, runs))):
-        if any(loops[file, line] != runs[0][file, line] for loops in runs):
+        if len({rounds[file, line] for rounds in runs}) > 1:
             return f"the loop at {Path(file).name}:{line}"
     return ""
 
 
-def traced_loops(simulator: Simulator, theta: np.ndarray, w: np.ndarray | None) -> Loops:
-    """Return the loops of one call of the cost at ``theta (d,)``, with the numbers of iterations of each run."""
-    loops: Loops = {}
+def rounds_of_loops(simulator: Simulator, theta: np.ndarray, w: np.ndarray | None) -> Counter[tuple[str, int]]:
+    """Return by file and line of a while loop how often its condition is computed by one call of the cost at ``theta (d,)``."""
+    rounds: Counter[tuple[str, int]] = Counter()
 
     def enter(frame: FrameType, event: str, argument: Any) -> Any:
-        file, last, running = frame.f_code.co_filename, frame.f_lineno, dict[int, int]()
-        own = {} if event != "call" or any(folder in file for folder in SKIPPED) else _while_loops(file)
+        file = frame.f_code.co_filename
+        lines = set() if any(folder in file for folder in SKIPPED) else _while_loops(file)
 
         def follow(frame: FrameType, event: str, argument: Any) -> Any:
-            nonlocal last
-            line, is_round = frame.f_lineno, event == "line" and frame.f_lineno in own
-            is_new = is_round and not line <= last <= own[line]
-            for each in [one for one in running if event == "return" or (is_new and one == line)]:
-                loops.setdefault((file, each), set()).add(running.pop(each))
-            if is_round:
-                running[line] = running.get(line, 0) + 1
-            last = line
+            if event == "line" and frame.f_lineno in lines:
+                rounds[file, frame.f_lineno] += 1
             return follow
 
-        return follow if own else None
+        return follow if lines else None
 
     simulator.trace(enter, *(part for part in (theta[:, None], w) if part is not None))
-    return loops
+    return rounds
 
 
 @cache
-def _while_loops(file: str) -> dict[int, int]:
-    """Return the last line of each while loop of a file by the line at which each of its rounds begins.
+def _while_loops(file: str) -> set[int]:
+    """Return the line at which each round of each while loop of a file begins.
 
     A for loop runs over a list, whose length is often the number of contacts rather than of steps.
     """
     try:
         nodes = ast.walk(ast.parse("".join(linecache.getlines(file))))
     except SyntaxError:
-        return {}
+        return set()
     loops = [node for node in nodes if isinstance(node, ast.While)]
-    firsts = [loop.body[0] if isinstance(loop.test, ast.Constant) else loop for loop in loops]
-    return {first.lineno: loop.end_lineno or first.lineno for first, loop in zip(firsts, loops, strict=True)}
+    # the condition of `while True` is not computed
+    return {(loop.body[0] if isinstance(loop.test, ast.Constant) else loop).lineno for loop in loops}
 
 
 # ------------------------------------------------------------------------------------------------------------- JAX

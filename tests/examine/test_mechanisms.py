@@ -8,13 +8,16 @@ from functools import partial
 import mechanisms
 import numpy as np
 import pytest
+import simulators
 
 import bench
 from bench.errors import UserError
 from bench.examine import lines
 from bench.examine.findings import GroupSize
+from bench.examine.steps import changing_loop
 from bench.examine.subspace import groups_of
 from bench.report.text import number
+from bench.simulator.simulator import Simulator
 from bench.simulator.tree import ParameterTree
 
 examine = partial(bench.examine, progress=False, calls=3000)
@@ -295,3 +298,13 @@ def test_a_cost_that_depends_on_the_call_before_is_named():
     given = mechanisms.WarmStarted()
     report = bench.examine(given.cost, [1.0, 2.0], grad=given.gradient, calls=3000, progress=False)
     assert "the cost depends on the call before it" in report.spread_text
+
+
+def test_a_loop_without_a_condition_has_a_length_too():
+    start = np.array([0.6, 1.2])
+    simulator = Simulator(simulators.bounces, ParameterTree(start))
+    assert re.fullmatch(
+        r"the loop at simulators\.py:\d+", changing_loop(simulator, np.outer(start, [0.2, 0.6, 1.5]), None)
+    )
+    fixed = Simulator(swing, ParameterTree(START))
+    assert changing_loop(fixed, np.outer(START, [0.2, 0.6]), None) == ""
