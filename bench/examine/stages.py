@@ -19,7 +19,7 @@ import numpy as np
 from bench.examine.few import ROUNDS, FewSteps, is_nothing
 from bench.examine.subspace import Group, Subspace, choose, count_of, locate
 from bench.gradient import EPS, FAULTS, TRUSTED, Check, Options, Part, Sample, check, step_sizes
-from bench.gradient.check import NOTHING, cause_of
+from bench.gradient.check import ELSEWHERE, NOTHING, cause_of
 from bench.gradient.roughness import FINE
 from bench.simulator.clock import OutOfTime
 from bench.simulator.simulator import Simulator
@@ -309,11 +309,11 @@ class GradientStages:
         costs = ((size + options.directions) * (1 + options.repeated) + options.draws * options.directions) * each
         wrong = sum(part.verdict in FAULTS for part in self.check.parts)
         if wrong and options.draws:
-            costs += min(4, options.draws) * wrong * each + 4 * options.draws * each
+            costs += min(ELSEWHERE, options.draws) * wrong * each
         unclear = wrong + sum(part.verdict == "rounding" for part in self.check.parts)
         if unclear and options.scanned:
             costs += min(unclear + options.directions, options.scanned) * SCAN
-        gradients = 0 if self.gradient is None else 3 + options.draws * (3 if wrong else 1)
+        gradients = 0 if self.gradient is None else 3 + options.draws
         return costs, gradients
 
     def enough(self) -> tuple[float, float]:

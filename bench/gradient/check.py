@@ -30,14 +30,12 @@ SUSPICIOUS = 4
 """Default of :attr:`Options.scanned`."""
 ELSEWHERE = 4
 """Most other thetas at which the ratio of a wrong component is computed."""
-FAR = (1.0, 3.0)
-"""Standard deviations, in units of each input's scale, of thetas where a term such as a contact may be inactive."""
 LOOSE = 1e-3
 """Largest error of a slope, relative to the largest |gradient * scale|, that a solver which stops early explains."""
 EXPLAINED = 10.0
 """Largest such error as a multiple of the sum of the cost's jumps per unit of a direction."""
-PLAINLY = ("smooth", "nonlinear", "mode_crossing")
-"""Verdicts that count as right at the thetas drawn with :data:`FAR`."""
+CLEAR = ("smooth", "nonlinear", "mode_crossing", "zero", "nonfinite", "nondeterministic")
+"""Verdicts on a direction that is not searched for a staircase."""
 
 
 @dataclass(frozen=True)
@@ -418,11 +416,10 @@ class _Checker:
         Directions that are clearly right are not scanned. A derivative of exactly 0 is not clearly right where
         differences are not 0, since it may be the slope of a tread.
         """
-        clear = (*PLAINLY, "zero", "nonfinite", "nondeterministic")
         to_scan = [
             m
             for m, (sample, finding) in enumerate(zip(measured, findings, strict=True))
-            if finding.verdict not in clear
+            if finding.verdict not in CLEAR
             or (finding.verdict == "nonlinear" and sample.derivative == 0.0 and sample.differences.any())
         ][: self.options.scanned]
         along = roughness.staircase_offsets(self.unit)
@@ -475,31 +472,9 @@ class _Checker:
                 ratios[part.component].append(part.ratio_with_error)
         whole = [part for part in (*parts, *draws) if part.component is None and part.verdict == "wrong_adjoint"]
         right = any(part.verdict in TRUSTED and part.verdict != "zero" for part in parts if part.component is not None)
-        along = [part.ratio_with_error for part in whole]
-        cause = causes_of_ratios(ratios, along, right)
-        if "wrong_adjoint" in cause.values() and self._is_right_far_away():
-            cause = causes_of_ratios(ratios, along, right, right_elsewhere=True)
+        cause = causes_of_ratios(ratios, [part.ratio_with_error for part in whole], right)
         renamed = [_named(part, cause.get(part.component, cause[None])) for part in parts]
         return renamed, [_named(part, cause[None]) for part in draws]
-
-    def _is_right_far_away(self) -> bool:
-        """Return whether the gradient is right at some theta farther away, so that a missing term acts only near theta.
-
-        The gradient must be right along two random directions, since one may agree by chance. A slope of exactly 0 does
-        not count.
-        """
-        count = self.options.draws
-        away = np.repeat(FAR, count) * self.scale[:, None]
-        thetas = (self.theta[:, None] + away * self.random.standard_normal((self.theta.size, len(FAR) * count))).T
-        right = [(theta, self.gradient(theta)) for theta in thetas]
-        for _ in range(2):
-            vectors = self.scale[:, None] * self.random.standard_normal((self.theta.size, len(right)))
-            lines = [_Line("", *each, vector) for each, vector in zip(right, vectors.T, strict=True)]
-            parts = self._check_lines(lines, twice=False)
-            right = [
-                each for each, part in zip(right, parts, strict=True) if part.verdict in PLAINLY and part.program != 0.0
-            ]
-        return bool(right)
 
 
 def _real(name: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
