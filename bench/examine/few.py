@@ -71,7 +71,7 @@ class FewSteps:
             causes = causes_of_ratios(ratios, [], any(part.verdict == "smooth" for part in parts))
             if set(causes.values()) == {"wrong_factor"}:
                 parts = [replace(p, verdict="wrong_factor") if i in ratios else p for i, p in enumerate(parts)]
-        return self.space.restore(Check(cause_of(parts), gradient, tuple(parts), ()))
+        return self.space.restore(Check(cause_of(parts), tuple(parts), ()))
 
     @np.errstate(all="ignore")
     def _part(self, index: int, program: float) -> Part:

@@ -117,7 +117,6 @@ class Check:
 
     cause: str
     """The verdict of :func:`cause_of`, one of :data:`.rules.VERDICTS`; ``undecided`` without a part."""
-    gradient: np.ndarray
     parts: tuple[Part, ...]
     """Components and random directions at theta."""
     draws: tuple[Part, ...]
@@ -183,7 +182,7 @@ def cause_of(parts: Sequence[Part], draws: Sequence[Part] = (), others: Sequence
     return min(verdicts, key=lambda verdict: (-verdicts.count(verdict), VERDICTS.index(verdict)))
 
 
-NOTHING = Check("undecided", np.empty(0), (), ())
+NOTHING = Check("undecided", (), ())
 """The outcome of a check that was not made."""
 
 
@@ -245,7 +244,8 @@ def settle(
 class _Line:
     """A direction to check: from ``theta (d,)`` along ``vector (d,)``, where the program has ``gradient (d,)``.
 
-    A derivative is per unit of ``length``, the vector's length in units of the derivative.
+    A derivative is per unit of ``length``, the vector's length in units of the derivative: of the input for a component, of
+    the inputs' scales for a random direction.
     """
 
     name: str
@@ -294,105 +294,109 @@ class _Checker:
 
     def gradient(self, theta: np.ndarray) -> np.ndarray:
         if self._gradient is None:
-            return np.full(theta.size, np.nan)
+            return np.zeros(theta.size)
         return _real("gradient", self._gradient(theta.copy()), theta.shape)
 
     def run(self) -> Check:
         theta, options = self.theta, self.options
         first = self.gradient(theta)
-        chosen = extremes(first * self.scale, options.components)
-        around = theta[:, None] + options.reach * self.scale[:, None] * self.random.standard_normal(
-            (theta.size, options.draws)
-        )
+        drawn = self.random.standard_normal((theta.size, options.draws)).T
         # theta changes only in its last digits, so every change of the gradient is rounding
         with np.errstate(invalid="ignore"):
             moved = np.abs(self.gradient(theta + 4.0 * self.unit * self.scale) - first)
-        at_draws = [self.gradient(other) for other in around.T]
+        self._moved = np.nan_to_num(moved, nan=0.0, posinf=0.0)
+        elsewhere = [(other, self.gradient(other)) for other in theta + options.reach * self.scale * drawn]
         again = self.gradient(theta)
-        lines = [_Line(f"component {i}", theta, first, self._along(i), self.scale[i], i) for i in chosen]
-        lines += [_Line(f"direction {i}", theta, first, vector) for i, vector in enumerate(self._directions())]
-        parts = self._check_lines(lines, moved)
-        draws = self._check_lines(
-            [
-                _Line(f"other theta {k} direction {i}", other, gradient, vector)
-                for k, (other, gradient) in enumerate(zip(around.T, at_draws, strict=True))
-                for i, vector in enumerate(self._directions())
-            ],
-            moved,
-            twice=False,
-        )
-        parts, draws = self._with_causes(parts, draws, around, at_draws)
+        chosen = extremes(first * self.scale, options.components)
+        lines = [self._along(i, theta, first) for i in chosen]
+        parts = self._check_lines([*lines, *self._directions("", theta, first)], is_thorough=True)
+        draws = self._check_lines([
+            line for k, each in enumerate(elsewhere) for line in self._directions(f"other theta {k} ", *each)
+        ])  # fmt: skip
+        parts, draws = self._with_causes(parts, draws, elsewhere)
         others = []
-        if not np.isfinite(first).all() and self._gradient is not None and np.isfinite(self.cost(theta[:, None])).all():
+        if not np.isfinite(first).all() and np.isfinite(self.cost(theta[:, None])).all():
             others.append("nan_gradient")
         elif not repeats(first, again, self.unit).all():
             others.append("nondeterministic")
         # at other thetas only faults count: a kink at another theta is not a kink at theta
-        return Check(cause=cause_of(parts, draws, others), gradient=first, parts=tuple(parts), draws=tuple(draws))
+        return Check(cause_of(parts, draws, others), tuple(parts), tuple(draws))
 
-    def _along(self, component: int) -> np.ndarray:
-        """Return the vector ``(d,)`` of a component, of the length of its scale."""
-        vector = np.zeros(self.theta.size)
-        vector[component] = self.scale[component]
-        return vector
+    def _along(self, component: int, theta: np.ndarray, gradient: np.ndarray) -> _Line:
+        """Return the line of a component, whose vector has the length of the component's scale."""
+        scale = self.scale[component]
+        return _Line(
+            f"component {component}", theta, gradient, scale * np.eye(1, theta.size, component)[0], scale, component
+        )
 
-    def _directions(self) -> np.ndarray:
-        """Return random directions ``(n, d)``, of length 1 in units of the inputs' scales."""
-        random = self.random.standard_normal((self.theta.size, self.options.directions))
+    def _directions(self, name: str, theta: np.ndarray, gradient: np.ndarray) -> list[_Line]:
+        """Return lines along random vectors of length 1 in units of the inputs' scales."""
+        random = self.random.standard_normal((theta.size, self.options.directions))
         random *= self.scale[:, None] / np.linalg.norm(random, axis=0)
-        return random.T
+        return [_Line(f"{name}direction {i}", theta, gradient, vector) for i, vector in enumerate(random.T)]
 
-    def _check_lines(self, lines: Sequence[_Line], moved: np.ndarray | None = None, twice: bool = True) -> list[Part]:
+    def _check_lines(self, lines: Sequence[_Line], is_thorough: bool = False) -> list[Part]:
         """Return a checked part for each line, from one batch of costs.
 
-        ``moved (d,)`` is the change of the gradient where theta changes in its last digits.
-
-        A component's derivative is per unit of the input. A derivative along a random direction is per unit of the
-        inputs' scales.
+        A thorough check computes costs twice, and searches for staircases and for smaller steps that settle a direction.
         """
         if not lines:
             return []
         thetas, gradients, vectors = (
-            np.stack(columns, axis=1) for columns in zip(*((o.theta, o.gradient, o.vector) for o in lines), strict=True)
+            np.stack([getattr(line, name) for line in lines], axis=1) for name in ("theta", "gradient", "vector")
         )
         lengths = np.array([line.length for line in lines])
         with np.errstate(invalid="ignore"):
             program = np.where(vectors != 0.0, vectors * gradients, 0.0).sum(axis=0) / lengths
-        if self._gradient is None:
-            program = np.zeros(len(lines))
-        # a component this much smaller than the others may be only their rounding, unless it is exactly 0
         whole = np.abs(np.nan_to_num(gradients, posinf=0.0, neginf=0.0)) * self.scale[:, None]
-        doubts = np.where(program != 0.0, np.sqrt(self.unit) * whole.max(axis=0) / lengths, 0.0)
-        change = np.zeros(self.theta.size) if moved is None else np.nan_to_num(moved, nan=0.0, posinf=0.0)
-        measured, minus, plus = sampled(
+        largest = whole.max(axis=0)
+        # a component this much smaller than the others may be only their rounding, unless it is exactly 0
+        doubts = np.where(program != 0.0, np.sqrt(self.unit) * largest / lengths, 0.0)
+        samples, minus, plus = sampled(
             self.cost, thetas, vectors, lengths, program, self.unit, self.options.eps, self._modes,
-            twice and self.options.repeated, doubts, np.abs(vectors).T @ change / lengths,
+            is_thorough and self.options.repeated, doubts, np.abs(vectors).T @ self._moved / lengths,
         )  # fmt: skip
         if self._gradient is None:
-            measured = [replace(s, derivative=judge(s).difference) for s in measured]
-        findings = [judge(sample) for sample in measured]
-        if twice:
-            findings = self._with_staircases(lines, measured, findings)
-        for m, (line, finding) in enumerate(zip(lines, findings, strict=True)):
-            if twice and finding.verdict == "unsettled" and self._gradient is not None:
-                better = settle(self.cost, line.theta, line.vector, line.length, measured[m], self._tangent)
-                findings[m] = better or finding
-        apart = lengths * [abs(f.difference - s.derivative) for f, s in zip(findings, measured, strict=True)]
-        wrong = [m for m, finding in enumerate(findings) if finding.verdict == "wrong_adjoint"]
-        if (apart[wrong] <= LOOSE * whole[:, wrong].max(axis=0)).all():  # no solver excuses one that is plainly wrong
-            for m in wrong:
-                if self._has_loose_solver(lines[m], float(apart[m])):
-                    findings[m] = replace(findings[m], verdict="rounding")
-        return [
-            Part(name=line.name, component=line.component, sample=sample, modes=(tuple(a), tuple(b)), **vars(finding))
-            for line, sample, finding, a, b in zip(lines, measured, findings, minus, plus, strict=True)
+            samples = [replace(sample, derivative=judge(sample).difference) for sample in samples]
+        parts = [
+            Part(
+                name=line.name,
+                component=line.component,
+                sample=sample,
+                modes=(tuple(a), tuple(b)),
+                **vars(judge(sample)),
+            )
+            for line, sample, a, b in zip(lines, samples, minus, plus, strict=True)
         ]
+        if is_thorough:
+            parts = self._with_staircases(lines, parts)
+            parts = [self._settled(line, part) for line, part in zip(lines, parts, strict=True)]
+        return self._with_loose_solvers(lines, parts, largest)
+
+    def _settled(self, line: _Line, part: Part) -> Part:
+        """Return an unsettled part with the finding of smaller steps or of the tangent; others as they are."""
+        if part.verdict != "unsettled" or self._gradient is None:
+            return part
+        finding = settle(self.cost, line.theta, line.vector, line.length, part.sample, self._tangent)
+        return part if finding is None else replace(part, **vars(finding))
+
+    def _with_loose_solvers(self, lines: Sequence[_Line], parts: list[Part], largest: np.ndarray) -> list[Part]:
+        """Return the parts; wrong ones are ``rounding`` where small jumps of the cost, of a solver that stops early, explain them.
+
+        ``largest`` is the largest |gradient * scale| at each line's theta. No solver excuses an error that is plainly wrong.
+        """
+        errors = [line.length * abs(part.difference - part.program) for line, part in zip(lines, parts, strict=True)]
+        wrong = [m for m, part in enumerate(parts) if part.verdict == "wrong_adjoint"]
+        if all(errors[m] <= LOOSE * largest[m] for m in wrong):
+            for m in wrong:
+                if self._has_loose_solver(lines[m], errors[m]):
+                    parts[m] = replace(parts[m], verdict="rounding")
+        return parts
 
     def _has_loose_solver(self, line: _Line, apart: float) -> bool:
         """Return whether small jumps of the cost explain an error ``apart`` of a slope in units of the inputs' scales.
 
-        Such jumps show a solver that stops early. The cost is scanned along its gradient, for at most
-        :attr:`Options.scanned` thetas.
+        The cost is scanned along its gradient, for at most :attr:`Options.scanned` thetas.
         """
         steepest = self.scale * line.gradient
         vector = self.scale * steepest / np.linalg.norm(steepest)
@@ -408,73 +412,64 @@ class _Checker:
                 self._rates.append(roughness.stopping_rate(values, 2.0 * reach, least))
         return apart <= EXPLAINED * max(self._rates)
 
-    def _with_staircases(
-        self, lines: Sequence[_Line], measured: list[Sample], findings: list[Finding]
-    ) -> list[Finding]:
-        """Return the findings, replaced for each direction along which the cost is a staircase.
+    def _with_staircases(self, lines: Sequence[_Line], parts: list[Part]) -> list[Part]:
+        """Return the parts, judged again for each direction along which the cost is a staircase.
 
         Directions that are clearly right are not scanned. A derivative of exactly 0 is not clearly right where
         differences are not 0, since it may be the slope of a tread.
         """
         to_scan = [
             m
-            for m, (sample, finding) in enumerate(zip(measured, findings, strict=True))
-            if finding.verdict not in CLEAR
-            or (finding.verdict == "nonlinear" and sample.derivative == 0.0 and sample.differences.any())
-        ][: self.options.scanned]
+            for m, part in enumerate(parts)
+            if part.verdict not in CLEAR
+            or (part.verdict == "nonlinear" and part.program == 0.0 and part.sample.differences.any())
+        ]
         along = roughness.staircase_offsets(self.unit)
-        for m in to_scan:
+        for m in to_scan[: self.options.scanned]:
             at = lines[m].theta[:, None] + lines[m].vector[:, None] * along.reshape(1, -1)
-            values = self.cost(at).reshape(along.shape)
-            for row in values:
+            for row in self.cost(at).reshape(along.shape):
                 if roughness.is_staircase(row, 8.0 * self.unit * float(np.abs(row).max())):
-                    findings[m] = self._judge_staircase(measured[m], findings[m], row)
+                    parts[m] = self._judge_staircase(parts[m], row)
                     break
-        return findings
+        return parts
 
-    def _judge_staircase(self, sample: Sample, finding: Finding, row: np.ndarray) -> Finding:
-        """Return the finding on a staircase: ``precision`` where the gradient is right on scales above its treads.
+    def _judge_staircase(self, part: Part, row: np.ndarray) -> Part:
+        """Return the part on a staircase: ``precision`` where the gradient is right on scales above its treads.
 
         A cast to a shorter float keeps the gradient, a cast to an integer removes it.
         """
-        tread = float(np.ptp(np.diff(row)))
+        sample, tread = part.sample, float(np.ptp(np.diff(row)))
         if GUARD * float(self.unit) * abs(sample.centre) >= tread:
-            return finding
+            return part
         coarse = judge(replace(sample, noise=max(sample.noise, tread)))
-        return replace(coarse, verdict="precision" if coarse.verdict in TRUSTED else "staircase")
+        verdict = "precision" if coarse.verdict in TRUSTED else "staircase"
+        return replace(part, **(vars(coarse) | {"verdict": verdict}))
 
     def _with_causes(
-        self, parts: list[Part], draws: list[Part], around: np.ndarray, at_draws: list[np.ndarray]
+        self, parts: list[Part], draws: list[Part], elsewhere: Sequence[tuple[np.ndarray, np.ndarray]]
     ) -> tuple[list[Part], list[Part]]:
         """Return ``parts`` and ``draws`` with the cause of each wrong derivative as its verdict.
 
-        Causes come from the ratios of derivatives to differences at theta and at other thetas.
+        Causes come from the ratios of derivatives to differences at theta and ``elsewhere``, at other thetas with their
+        gradients.
         """
         wrong = [part for part in (*parts, *draws) if part.verdict in ("wrong_adjoint", "disconnected")]
         if not wrong:
             return parts, draws
-        still = bool(at_draws) and all(np.array_equal(g, at_draws[0]) for g in at_draws)
         here = [part for part in parts if part.verdict in FAULTS]
-        if still and at_draws[0].any() and not here:
+        gradients = [gradient for _, gradient in elsewhere]
+        if gradients and gradients[0].any() and not np.ptp(gradients, axis=0).any() and not here:
             return parts, [_named(part, "stale_gradient") for part in draws]
-        components = [p.component for p in parts if any(p is one for one in wrong) and p.component is not None]
-        ratios = {i: [part.ratio_with_error for part in parts if part.component == i] for i in components}
-        again = self._check_lines(
-            [
-                _Line("", other, gradient, self._along(i), self.scale[i], i)
-                for other, gradient in list(zip(around.T, at_draws, strict=True))[:ELSEWHERE]
-                for i in components
-            ],
-            twice=False,
-        )
+        ratios = {part.component: [part.ratio_with_error] for part in wrong if part.component is not None}
+        again = self._check_lines([self._along(i, *each) for each in elsewhere[:ELSEWHERE] for i in ratios])
         for part in again:
             if part.component is not None and part.verdict in ("wrong_adjoint", *TRUSTED):
                 ratios[part.component].append(part.ratio_with_error)
-        whole = [part for part in (*parts, *draws) if part.component is None and part.verdict == "wrong_adjoint"]
-        right = any(part.verdict in TRUSTED and part.verdict != "zero" for part in parts if part.component is not None)
-        cause = causes_of_ratios(ratios, [part.ratio_with_error for part in whole], right)
-        renamed = [_named(part, cause.get(part.component, cause[None])) for part in parts]
-        return renamed, [_named(part, cause[None]) for part in draws]
+        along = [part.ratio_with_error for part in wrong if part.component is None and part.verdict == "wrong_adjoint"]
+        is_some_right = any(p.verdict in TRUSTED and p.verdict != "zero" for p in parts if p.component is not None)
+        causes = causes_of_ratios(ratios, along, is_some_right)
+        renamed = [_named(part, causes.get(part.component, causes[None])) for part in parts]
+        return renamed, [_named(part, causes[None]) for part in draws]
 
 
 def _real(name: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
