@@ -44,7 +44,7 @@ def run(words: Sequence[str]) -> Report:
         if key not in SETTINGS:
             raise unknown("setting of examine", key, SETTINGS)
         if key in FILES:
-            local_path(key, settings[key])
+            _refuse_unwritable(key, settings[key])
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(COMPILED))  # which JAX reads when it is imported
     report = _examined(names[0], settings, QUIET not in words)
     if "baseline" in settings:
@@ -60,6 +60,14 @@ def run(words: Sequence[str]) -> Report:
 def main(words: Sequence[str]) -> int:
     """Run the command, and return the exit status: 0 right, 1 wrong, 3 not decided; 2 is bad input."""
     return run(words).status
+
+
+def _refuse_unwritable(key: str, given: str) -> None:
+    """Raise :class:`UserError` for a file that could not be written when the examination is over."""
+    path = local_path(key, given).absolute()
+    present = next(above for above in (path, *path.parents) if above.exists())
+    if not os.access(present, os.W_OK) or (present.is_file() and not (key == "baseline" and present == path)):
+        raise UserError(f"{key}={given} cannot be written, because of '{present}'")
 
 
 def _examined(cost: str, settings: Mapping[str, str], progress: bool) -> Report:
