@@ -366,13 +366,16 @@ def mysim(tmp_path):
         (["{}:leaves"], "it ended the process by sys.exit"),
         (["{}:nothing"], "the cost returned None"),
         (["{}:cost", "sigma=0"], "numbers above 0"),
+        (["{}:cost", "sigma="], "sigma= is not a list of numbers"),
         (["{}:cost", "theta=1"], "index 1 is out of bounds"),
         (["{0}:cost", "calls=20", "save={0}/folder"], "cannot be"),
     ],
 )
 def test_command_says_what_is_wrong_with_its_words(mysim, capsys, words, said):
     assert cli.main(["examine", *(word.format(mysim) for word in words)]) == 2
-    assert said in capsys.readouterr().err
+    answer = capsys.readouterr()
+    assert said in answer.err
+    assert answer.out == ""
 
 
 @pytest.mark.parametrize("file", ["save", "baseline"])
