@@ -24,8 +24,8 @@ def write(directory: Path, results: Results) -> list[Path]:
     drawn = []
     with styled():
         for chart in filter(None, (tables.chart(claim, result) for claim, result in results)):
-            drawn.append((chart, draw(chart)))
-            save(drawn[-1][1], directory / chart.name, data=chart.plotted())
+            drawn.append((chart, [draw(chart)]))
+            save(drawn[-1][1][0], directory / chart.name, data=chart.plotted())
     figures, answer = tables.figures_table(results), tables.count_verdicts(results)
     columns = [text("claim"), *tables.FIGURE[:3], tables.FIGURE[4], text("verdict"), text("lesson")]
     cells = cells_data(tables.for_readers(figures), columns)

@@ -167,7 +167,7 @@ def _composed_files(name: str, config_dirs: tuple[Path, ...], stamps: object) ->
 
 
 NEUTRAL = (
-    "experiment", "name", "results_dir", "answer", "compares", "formats", "compile_cache", "plugins", "workers", "timeout",
+    "experiment", "name", "results_dir", "answer", "compares", "formats", "chart_columns", "compile_cache", "plugins", "workers", "timeout",
     "memory", "on_error", "ladder", "versions", "retry", "shard",
 )  # fmt: skip
 """Settings that decide no result: where others differ from those of its file, the answer of an experiment does not hold."""
@@ -319,6 +319,7 @@ def from_settings(config: Mapping[str, Any]) -> Experiment:
         marks=_mapping(config, "marks"),
         compares=_compares(config),
         formats=tuple(_one_of("formats", item, FORMATS) for item in _as_list(config["formats"])),
+        chart_columns=int(_one_of("chart_columns", str(config["chart_columns"]), ("1", "2"))),
         reference=cast(Budget, build(Budget, _mapping(config, "reference", parameters(Budget)))),
         compile_cache=_compile_cache(config["compile_cache"]),
         plugins=registry.folders(),

@@ -98,6 +98,8 @@ class Experiment:
     """What charts show side by side: names of backends or estimators, or values of an axis, of which two are joined by arrows."""
     formats: tuple[str, ...] = ("png",)
     """File formats of the charts."""
+    chart_columns: int = 2
+    """Columns of a paper that charts in files may be wide, 1 or 2."""
     reference: Budget = Budget()
     compile_cache: Path | None = None
     """Folder in which compiled programs are cached between runs."""
@@ -130,6 +132,7 @@ class Experiment:
                 for name in ("descent", "samples", "repeats", "seed", "timing", "marks", "compares")
             },
             "formats": list(self.formats),
+            "chart_columns": self.chart_columns,
             "reference": dataclasses.asdict(self.reference),
             "results_dir": str(self.results_dir),
             "compile_cache": None if self.compile_cache is None else str(self.compile_cache),

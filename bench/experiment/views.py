@@ -96,7 +96,9 @@ class Chart:
     band: bool = False
     """Whether intervals are drawn as bands and not as bars."""
     own_scales: bool = False
-    """Whether each panel has its own scale of y (of x, for dots); panels above each other then share that of x."""
+    """Whether each panel has its own scale of y (of x, for dots); plots are then above each other and share that of x.
+
+    Without ``panel``, each quantity of ``y`` has a panel."""
 
     def __post_init__(self) -> None:
         if missing := sorted(set(self._names()) - set(self.frame)):

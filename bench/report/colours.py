@@ -16,6 +16,9 @@ from bench.experiment.views import Chart, Style
 from bench.model import registry
 from bench.report.style import MARKERS, VARIANTS, colour, marker
 
+BESIDE = (7, 6, 4, 3, 1, 2, 5, 0)
+"""Places in the palette of trainers and of searches by costs: first those that few estimators have, since both share charts."""
+
 
 def looks_by_name(charts: Sequence[Chart]) -> dict[str, Style]:
     """Return the look of each series or level of some charts; those without a given style get a free colour each, in order."""
@@ -46,14 +49,20 @@ def graded(
 
 
 def estimator_style(estimator: str, variant: int = 0) -> Style:
-    """Return the look of an estimator or trainer: its colour, with a marker and dashes for each of its parameter variants, from 0."""
-    names = order_of("trainers" if estimator in registry.entries()["trainers"] else "estimators")
+    """Return the look of an estimator, a trainer or a search by costs, with a marker and dashes for each of its variants, from 0.
+
+    Estimators have the colours of the palette in its order, the others in that of :data:`BESIDE`.
+    """
+    others, names = searches(), order_of("estimators")
     place = names.index(estimator) if estimator in names else len(names)
+    if estimator in others:
+        place = others.index(estimator)
+        place = BESIDE[place] if place < len(BESIDE) else place
     return Style(colour(place), marker(place, variant), VARIANTS[variant % len(VARIANTS)])
 
 
 def method_styles(methods: Iterable[str]) -> dict[str, Style]:
-    """Return the look of each method, named by its estimator first: ``alpha_order[gamma=1], adam``."""
+    """Return the look of each method, named by its estimator or search first: ``alpha_order[gamma=1], adam``."""
     looks: dict[str, Style] = {}
     uses: Counter[str] = Counter()
     for method in sorted(methods, key=lambda name: "[" in name):
@@ -61,6 +70,13 @@ def method_styles(methods: Iterable[str]) -> dict[str, Style]:
         looks[method] = estimator_style(estimator, uses[estimator])
         uses[estimator] += 1
     return looks
+
+
+def searches() -> list[str]:
+    """Return the optimizers that use costs only, which stand beside estimators, and the trainers."""
+    optimizers = registry.entries()["optimizers"]
+    alone = [name for name in order_of("optimizers") if getattr(optimizers[name].plugin, "needs", None) == {"value"}]
+    return [*alone, *(name for name in order_of("trainers") if name not in alone)]
 
 
 def order_of(kind: str) -> list[str]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any, Literal
 
 import numpy as np
@@ -39,6 +40,10 @@ BOLD = 1.3
 """Width of a bold title relative to the same text elsewhere."""
 UPWARDS = (1.0, 1.6, 2.4, 3.2)
 """Lengths in inches of labels that read upwards, the first that fits."""
+DOT = 0.075
+"""Height in inches of a series in a row of dots."""
+BELOW = 0.35
+"""Height of further quantities below the first, relative to its height."""
 UNLIMITED = 1e9
 """Factor on a value at which the bar of an interval without an upper end stops, beyond every logarithmic axis."""
 BAND: dict[str, Any] = {"color": "#D55E00", "alpha": 0.12, "linewidth": 0}
@@ -47,6 +52,8 @@ EXACT, USELESS = 1e-4, 1e2
 """Where a value above 1 means a failure, smaller values are drawn here as upper limits, and larger ones with their number."""
 NAME = 0.8
 """Longest line of a name at a point, in inches."""
+BEHIND: dict[str, Any] = {"facecolor": "#ffffff", "alpha": 0.7, "linewidth": 0, "pad": 0.5}
+"""Look of the ground of a name at a point, which may cross an arrow."""
 NEAR = 0.2
 """Distance in inches from which an arrow joins two points."""
 LIMIT: dict[str, Any] = {"color": "#000000", "linewidth": 1.4}
@@ -55,13 +62,20 @@ MANY = 12
 """Most points of a line that are drawn with markers; longer lines are drawn without."""
 
 
-def draw(chart: Chart) -> Figure:
-    """Return the chart as a figure, two columns of a paper wide, or one for a single panel with a plot."""
+def draw(chart: Chart, is_narrow: bool = False) -> Figure:
+    """Return the chart as a figure, two columns of a paper wide, or one for plots without panels side by side.
+
+    If ``is_narrow`` it is one column wide, with one panel across.
+    """
     panels = [(str(name), part) for name, part in chart.frame.groupby(chart.panel, sort=False)] if chart.panel else []
     panels = panels or [("", chart.frame)]
     is_plot = chart.kind in ("lines", "points")
-    width = NARROW if len(panels) == 1 and is_plot else WIDTH
-    down = math.ceil(len(panels) / max(1, min(chart.across, len(panels))))
+    quantities = [chart.y[0]] * len(panels)
+    if chart.own_scales and not chart.panel:
+        panels, quantities = panels * len(chart.y), list(chart.y)
+    most = 1 if is_narrow or not chart.panel else chart.across
+    width = NARROW if is_narrow or (is_plot and (len(panels) == 1 or not chart.panel)) else WIDTH
+    down = math.ceil(len(panels) / max(1, min(most, len(panels))))
     across = math.ceil(len(panels) / down)
     styles = looks_by_name([chart])
 
@@ -73,11 +87,15 @@ def draw(chart: Chart) -> Figure:
     labels = [[_wrapped(name, room) for name in names] for names in rows]
     written = [text for names in labels for text in names]
     inner = (width - beside * (0.7 if is_plot else max(map(_text_width, written), default=0.0))) / across - 0.12
-    row = max([chart.height, *(LINE * (1 + text.count("\n")) + 0.015 for text in written)])
+    is_spread = chart.kind == "dots" and not chart.join and chart.series not in ("", chart.y[0].name)
+    row = max(
+        [chart.height, DOT * len(styles) * is_spread, *(LINE * (1 + text.count("\n")) + 0.015 for text in written)]
+    )
     heights = [chart.height if is_plot else row * len(names) + 0.1 for names in rows]
+    heights = [height if y is chart.y[0] else BELOW * height for height, y in zip(heights, quantities, strict=True)]
 
     # quantities of the same runs above each other have one scale of x, so that their features can be compared
-    stacked = chart.own_scales and across == 1 and is_plot
+    stacked = chart.own_scales and is_plot
     ratios = [max(heights[i * across : (i + 1) * across]) for i in range(down)]
     figure = Figure(
         figsize=(width, 4 + 2 * sum(ratios)),
@@ -90,7 +108,7 @@ def draw(chart: Chart) -> Figure:
     ).ravel()  # fmt: skip
     for spare in grid[len(panels) :]:
         spare.remove()
-    for place, (panel, (name, part), names) in enumerate(zip(grid, panels, rows, strict=False)):
+    for place, (panel, (name, part), names, y) in enumerate(zip(grid, panels, rows, quantities, strict=False)):
         is_left, is_last = place % across == 0 or not shared, place + across >= len(panels)
         title = "\n".join(
             _wrapped(text, inner)
@@ -99,14 +117,16 @@ def draw(chart: Chart) -> Figure:
         )
         panel.set_title(title, loc="left", fontsize=SIZE)
         if is_plot:
-            _draw_lines(chart, panel, part, styles)
+            _draw_lines(chart, panel, part, styles, y)
             few = all(p[chart.x[0].name].nunique() <= 6 for _, p in panels)
             _scale_x(panel, chart.x[0], part[chart.x[0].name], few, bool(chart.arrow))
-            _scale_values(chart, panel, "y", chart.y[0], part if chart.own_scales else chart.frame)
-            if chart.arrow:
+            _scale_values(chart, panel, "y", y, part if chart.own_scales else chart.frame)
+            if y is not chart.y[0]:
+                panel.margins(y=0.4)
+            elif chart.arrow:
                 _draw_arrows(chart, panel, part, styles, np.array([inner, heights[place]]))
             panel.set_xlabel("" if stacked and not is_last else _wrapped(chart.x[0].heading, inner))
-            panel.set_ylabel(_wrapped(chart.y[0].heading, heights[place]) if is_left else "")
+            panel.set_ylabel(_wrapped(y.heading, heights[place]) if is_left else "")
         else:
             panel.set_yticks(range(len(names)), labels[place][::-1])
             panel.set_ylim(-0.5, len(names) - 0.5)
@@ -118,9 +138,9 @@ def draw(chart: Chart) -> Figure:
                 _draw_dots(chart, panel, part, styles, cells)
             else:
                 _draw_grid(chart, panel, part, styles, cells, inner)
+            panel.tick_params(labelbottom=is_last or chart.own_scales)
             if not is_last and not chart.own_scales:
                 panel.set_xlabel("")
-                panel.tick_params(labelbottom=False)
         _draw_marks(chart, panel, name)
     _frame(figure, chart, _legend(chart, styles, width))
     figure.draw_without_rendering()
@@ -263,9 +283,10 @@ def _scale_x(panel: Axes, column: Column, values: pd.Series, few: bool, is_named
     if not places.size:
         return
     if _is_log(column, places) and places[0] > 0:
-        margin = max((places[-1] / places[0]) ** (0.25 if is_named else 0.05), 1.08)
+        margin = max((places[-1] / places[0]) ** 0.05, 1.08)
+        before, after = (margin**2, margin**7) if is_named else (margin, margin)
         wanted = places if few and column.format == "setting" else ()
-        log_axis(panel, "x", places[0] / margin, places[-1] * margin, wanted, _values_text(column, 0.0))
+        log_axis(panel, "x", places[0] / before, places[-1] * after, wanted, _values_text(column, 0.0))
         return
     if few:
         panel.xaxis.set_major_locator(FixedLocator(list(places)))
@@ -299,8 +320,8 @@ def _draw_marks(chart: Chart, panel: Axes, name: str) -> None:
 # -------------------------------------------------------------------------------------------- lines and points
 
 
-def _draw_lines(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style]) -> None:
-    x, y = chart.x[0], chart.y[0]
+def _draw_lines(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], y: Column) -> None:
+    x = chart.x[0]
     log = _is_log(y, (part if chart.own_scales else chart.frame)[y.name])
     keys = [key for key in dict.fromkeys((chart.series, chart.line)) if key]
     laws = list(chart.frame[chart.line].unique()) if chart.arrow else []
@@ -335,14 +356,14 @@ def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str
     for series, place in named:
         text = _wrapped(series, NAME, r"_ ,/\[")
         width, height = extent = np.array([_text_width(text), 0.14 * (text.count("\n") + 1)])
-        sides = ((0.08, -height / 2), (-width - 0.08, -height / 2), (-width / 2, 0.08), (-width / 2, -height - 0.08))
-        starts = [place + side for side in sides]
+        across, along = (0.08, -width / 2, -width - 0.08), (-height / 2, 0.08, -height - 0.08)
+        starts = [place + side for side in product(across, along) if side != (across[1], along[0])]
         outside = [((start < 0) | (start + extent > size)).any() for start in starts]
         crossed = [sum((start < b).all() and (start + extent > a).all() for a, b in taken) for start in starts]
-        _, _, best = min(zip(outside, crossed, range(4), strict=True))
+        _, _, best = min(zip(outside, crossed, range(8), strict=True))
         taken.append((starts[best], starts[best] + extent))
         x, y = starts[best] / size
-        written = panel.text(x, y, text, transform=panel.transAxes, color=styles[series].colour)
+        written = panel.text(x, y, text, transform=panel.transAxes, color=styles[series].colour, bbox=BEHIND)
         written.set_in_layout(False)
 
 
@@ -433,7 +454,7 @@ def _draw_dots(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, 
     is_spread = not chart.join and part[y.name].nunique() < len(part)
     for order, (series, style) in enumerate(styles.items()):
         points = part[part[chart.series].astype(str) == series] if chart.series else part
-        shift = -0.5 * (order - (len(styles) - 1) / 2) / max(len(styles), 2) if is_spread else 0.0
+        shift = -0.75 * (order - (len(styles) - 1) / 2) / max(len(styles), 2) if is_spread else 0.0
         rows = np.array([place[str(v)] for v in points[y.name]]) + shift
         _draw_values(chart, panel, points, x, log, rows, style, style.marker or "o", 3)
     panel.grid(axis="y", color="#e4e4e4", linewidth=0.6)

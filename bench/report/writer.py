@@ -15,7 +15,7 @@ from bench.experiment.views import Chart, Table, Views
 from bench.report import terminal
 from bench.report.cells import TableCell, parts, readable, text_rows
 from bench.report.colours import looks_by_name
-from bench.report.draw import draw
+from bench.report.draw import NARROW, draw
 from bench.report.figures import save, styled
 from bench.report.latex import latex
 from bench.report.tables import csv_text, escape_markdown
@@ -28,11 +28,12 @@ LEAST = 3
 """Fewest values that are drawn."""
 
 
-def write(experiment: Experiment, views: Views, drawn: Sequence[tuple[Chart, Figure]]) -> list[Path]:
+def write(experiment: Experiment, views: Views, drawn: Sequence[tuple[Chart, Sequence[Figure]]]) -> list[Path]:
     """Write all tables, the charts as :func:`drawings` gives them, and the answer of an experiment; return the files' paths."""
     charts = []
     with styled():
-        for chart, figure in drawn:
+        for chart, widths in drawn:
+            figure = widths[-1 if experiment.chart_columns == 1 else 0]
             charts += save(figure, experiment.directory / chart.name, experiment.formats, chart.plotted())
     answer = answer_json(experiment.name, experiment.question, views.headline, drawn[0][0].name if drawn else "")
     files = {ANSWER: answer}
@@ -41,15 +42,21 @@ def write(experiment: Experiment, views: Views, drawn: Sequence[tuple[Chart, Fig
     return [*write_all(experiment.directory, files), *charts]
 
 
-def drawings(experiment: Experiment, views: Views) -> list[tuple[Chart, Figure]]:
-    """Return the charts with enough values to show something, drawn; those without a title have the experiment's question."""
+def drawings(experiment: Experiment, views: Views) -> list[tuple[Chart, list[Figure]]]:
+    """Return the charts with enough values to show something, drawn; those without a title have the experiment's question.
+
+    A chart that is wider than one column of a paper is drawn a second time as wide as that.
+    """
     charts = [chart for chart in views.charts if _is_telling(chart)]
     looks = looks_by_name(charts)
+    drawn = []
     with styled():
-        return [
-            (chart, draw(replace(chart, title=chart.title or experiment.question, styles={**looks, **chart.styles})))
-            for chart in charts
-        ]
+        for chart in charts:
+            shown = replace(chart, title=chart.title or experiment.question, styles={**looks, **chart.styles})
+            figure = draw(shown)
+            is_wide = figure.get_figwidth() > NARROW
+            drawn.append((chart, [figure, *([draw(shown, is_narrow=True)] if is_wide else [])]))
+    return drawn
 
 
 def _is_telling(chart: Chart) -> bool:

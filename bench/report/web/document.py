@@ -23,7 +23,7 @@ def page(
     question: str,
     views: Views,
     data: Mapping[str, Any],
-    drawn: Sequence[tuple[Chart, Figure]] = (),
+    drawn: Sequence[tuple[Chart, Sequence[Figure]]] = (),
     record: Mapping[str, Any] = MappingProxyType({}),
 ) -> str:
     """Return the page as HTML. ``data`` are the cells, see :func:`~bench.report.web.data.cells_data`, and ``record`` is ``run.json``."""
@@ -61,11 +61,11 @@ def _answers(views: Views) -> str:
     return f'<section id="answers"><h2>{escape(table.title)}</h2>{shell.table(texts)}</section>'
 
 
-def _chart(chart: Chart, figure: Figure) -> str:
+def _chart(chart: Chart, widths: Sequence[Figure]) -> str:
     """Return a chart as HTML with its heading and how to read it."""
     title = chart.title or chart.name.replace("_", " ").capitalize()
     text = f"<p>{escape(chart.text)}</p>" if chart.text else ""
-    return f"<section><h2>{escape(title)}</h2>{text}{shell.drawing(figure, chart.name, title)}</section>"
+    return f"<section><h2>{escape(title)}</h2>{text}{shell.drawing(widths, chart.name, title)}</section>"
 
 
 def _made(record: Mapping[str, Any]) -> str:

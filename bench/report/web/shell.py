@@ -69,7 +69,11 @@ def _breakable(text: str) -> str:
     return re.sub(r"(?<=\S)[,\[](?=\S)|_(?=[a-z]{6})", r"\g<0><wbr>", escape(text))
 
 
-def drawing(figure: Figure, name: str, description: str) -> str:
-    """Return a chart in a box that scrolls sideways where the window is narrow; no two of a page have one name."""
-    drawn = inline_svg(figure, name).replace("<svg", f'<svg role="img" aria-label="{escape(description)}"', 1)
-    return f'<div class="scroll drawing" tabindex="0">{drawn}</div>'
+def drawing(widths: Sequence[Figure], name: str, description: str) -> str:
+    """Return a chart in a box; no two of a page have one name. Of two ``widths`` the second is for narrow windows."""
+    boxes = []
+    for figure, kind in zip(widths, ("wide", "narrow") if len(widths) > 1 else ("",), strict=True):
+        drawn = inline_svg(figure, f"{name}{kind}")
+        drawn = drawn.replace("<svg", f'<svg role="img" aria-label="{escape(description)}"', 1)
+        boxes.append(f'<div class="drawing {kind}">{drawn}</div>')
+    return "".join(boxes)

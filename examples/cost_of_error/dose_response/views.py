@@ -9,17 +9,20 @@ from bench.experiment.axes import table as csv_table
 from bench.experiment.columns import Column, interval, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Mark, Style, Table, Views
-from bench.report.style import MARKERS, PALETTE
+from bench.report.colours import method_styles
+from bench.report.style import PALETTE
+from bench.report.text import counted
 
 from . import analysis
-from .analysis import BIAS, COSTS_ONLY, MAIN, RANDOM
+from .analysis import BEST, BIAS, COSTS_ONLY, MAIN, RANDOM
 
 STYLES = {
     RANDOM: Style(PALETTE[0], "o"),
     BIAS: Style(PALETTE[2], "^"),
 }
 """The errors that are drawn; the tables have the others and the natural methods."""
-VERDICTS = {"above 1": Style(PALETTE[2]), "below 1": Style(PALETTE[0]), "not known": Style("#767676")}
+NO_VERDICT = Style("#767676")
+VERDICTS = {"above 1": Style(PALETTE[2]), "below 1": Style(PALETTE[0]), "not known": NO_VERDICT}
 ENOUGH = 6
 """Fewest scenes with an interval."""
 CLASS, PROBLEMS, SCENES = (
@@ -91,7 +94,8 @@ def _chart(points: pd.DataFrame, pairs: pd.DataFrame) -> Chart:
         "cost_of_error", points.sort_values("method", kind="stable"), [Column("error", label="relative error", log=True)],
         [interval("time", label="updates / best gradient's", log=True)],
         kind="points", series="method", panel="scene_class", styles=STYLES, failed="is_missed", across=3, height=2.0,
-        panel_notes={row.Index: f"{row.problems} problems of {row.scenes} scenes" + f", fewer than {ENOUGH}: no intervals" * (row.scenes < ENOUGH)
+        marks=[Mark("the best gradient", 1.0, axis="y")],
+        panel_notes={row.Index: f"{row.problems} problems of {counted(row.scenes, 'scene')}" + f", fewer than {ENOUGH}: no intervals" * (row.scenes < ENOUGH)
                      for row in sizes.itertuples()},
         subtitle=f"To 1/{MAIN:g} of the first regret, each method at its best rate. Cross: half of the scenes miss it. "
         "A bar to the top: no upper end",
@@ -123,12 +127,10 @@ def _reached(known: pd.DataFrame) -> Table:
 
 def _reached_chart(known: pd.DataFrame) -> Chart:
     methods = dict.fromkeys(known.sort_values("kind", key=lambda kinds: kinds == COSTS_ONLY, kind="stable")["method"])
-    looks = {
-        method: Style(PALETTE[i % len(PALETTE)], MARKERS[i % len(MARKERS)], "none") for i, method in enumerate(methods)
-    }
+    looks = method_styles(methods) | {BEST: NO_VERDICT}
     return Chart(
         "reached", known, [Column("evaluations", label="rollouts and gradients to 1/100", low="fewest", high="most", log=True)],
         [text("problem", label="")], "dots", series="method", styles=looks, failed="missed", height=0.55,
         subtitle=f"To 1/{MAIN:g} of the first regret, each method at its best rate. Cross: most searches miss it",
-        text="A dot is the median over the searches of a method and a bar their range. A gradient counts as one rollout.",
+        text="Best gradient: without noise, or the mean of many costs times scores where the cost jumps. A dot is the median over the searches of a method and a bar their range. A gradient counts as one rollout.",
     )  # fmt: skip

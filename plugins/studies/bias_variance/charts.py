@@ -13,11 +13,12 @@ import pandas as pd
 
 from bench.errors import unknown
 from bench.experiment.axes import Axis
-from bench.experiment.columns import Column, text
+from bench.experiment.columns import Column, interval, text
+from bench.experiment.parameters import PROBLEM
 from bench.experiment.views import Chart, Mark, Style
 from bench.model import SURROGATE, registry
 from bench.report.colours import graded, method_styles
-from bench.report.problems import ProblemRows, split_by_problem
+from bench.report.problems import ProblemRows, problem_numbers, split_by_problem
 from bench.report.style import MARKERS, colour
 from bench.report.text import axis_value, counted, number
 from bench.report.views import (
@@ -48,6 +49,7 @@ BIAS = Column(
     "bias_shown", label="relative bias", low="bias_from", high="bias_to", limit="bias_limit", log=True,
     above_one="larger than the gradient",
 )  # fmt: skip
+COST = interval("cost", label="cost of a rollout", log=False)
 SECONDS = replace(COLUMNS.by_name["time_s"], label="time of one estimate", log=True)
 FASTEST = "each estimator on its fastest backend"
 ESTIMATOR = text("series", label="")
@@ -213,7 +215,11 @@ def _error_and_cost(shown: Arranged, subtitle: str) -> Chart | None:
 
 def _contrast(shown: Arranged, subtitle: str) -> Chart | None:
     """Return error against time at two values of an axis, joined by arrows, as the experiment's ``compares`` names them."""
-    rows = with_known(shown.rows, TIME)
+    program = problem_numbers(shown.rows, PROBLEM)
+    cost = (
+        shown.rows[[COST.name, COST.low, COST.high]].groupby(program).transform("first")
+    )  # all its cells have the same
+    rows = with_known(shown.rows.assign(**cost), TIME)
     joined_axis: tuple[Axis, Sequence[Any]] | None = None
     for name, values in shown.experiment.compares.items():
         axis = next((axis for axis in shown.axes if name in (axis.column, axis.short)), None)
@@ -234,9 +240,10 @@ def _contrast(shown: Arranged, subtitle: str) -> Chart | None:
     )  # the same program: what differs is noise
     frame = frame.assign(arrow=frame["series"] + ", " + frame["contact"], line=frame["contact"].str.partition("[")[0])
     return Chart(
-        "contrast", frame, [SECONDS], [RMSE], "points", series="series", line="line", arrow="arrow", height=2.9,
+        "contrast", frame, [SECONDS], [RMSE, *[COST] * bool(frame["cost"].notna().any())], "points", series="series", line="line",
+        arrow="arrow", height=2.9, own_scales=True,
         subtitle=", ".join(filter(None, [subtitle, f"arrows: {along.title} {axis_value(start)} to {axis_value(end)}", FASTEST])),
-        text="An arrow joins the same estimator at two settings.",
+        text="An arrow joins the same estimator at two settings. Below are the costs of the same rollouts at both, with bars for 95% of them.",
     )  # fmt: skip
 
 
@@ -246,7 +253,10 @@ def _on_fastest(rows: pd.DataFrame, cost: str = TIME) -> pd.DataFrame:
 
 
 def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Chart:
-    """Return the cost of each estimator to reach an error: a row per problem, with who is first and by what factor."""
+    """Return the cost of each estimator to reach an error: a row per problem, with who is first and by what factor.
+
+    Where backends are compared, each problem has a panel with a row per backend.
+    """
     kind, target = best["by"].iloc[0], TARGETS[0]
     backends = shown.experiment.compares.get("backends", ()) if kind == "time" else ()
     lead = best[(best["by"] == kind) & (best["relative error"] == target)].set_index("problem", drop=False)
@@ -256,15 +266,11 @@ def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Cha
         for name, needed in found.items():
             estimator, _, backend = name.partition(" on ")
             low, high = (needed.cost * math.exp(sign * size) for sign, size in ((-1, needed.down), (1, needed.up)))
-            lines.append({"problem": _with_lead(lead.loc[problem.title()]), "series": estimator, "panel": f"on {backend}" if backends else "",
-                          "cost": needed.cost, "low": low, "high": high, "limit": needed.how == "at once",
+            lines.append({"problem": _with_lead(lead.loc[problem.title()]), "series": estimator, "cost": needed.cost, "low": low, "high": high, "limit": needed.how == "at once",
                           "lost": not math.isfinite(needed.cost), "backend": backend})  # fmt: skip
     frame = pd.DataFrame(lines)
-    frame = (
-        frame[frame["backend"].isin(backends)]
-        if backends
-        else frame.sort_values("cost").drop_duplicates(["problem", "series"]).sort_index()
-    )
+    frame = frame.sort_values("cost").drop_duplicates(["problem", "series", *["backend"] * bool(backends)]).sort_index()
+    frame = frame[frame["backend"].isin(backends or frame["backend"])]
     label = f"{'time' if kind == 'time' else 'rollouts'} to a relative error of {target:.0%}"
     cost = Column(
         "cost",
@@ -276,8 +282,8 @@ def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Cha
         log=True,
     )
     return Chart(
-        "speed_accuracy" if kind == "time" else "rollouts_accuracy", frame, [cost], [text("problem", label="")], "dots", series="series",
-        panel="panel" if backends else "", failed="lost", across=2, height=0.42,
+        "speed_accuracy" if kind == "time" else "rollouts_accuracy", frame, [cost], [text("backend" if backends else "problem", label="")],
+        "dots", series="series", panel="problem" if backends else "", failed="lost", across=3, height=0.25,
         subtitle=", ".join(filter(None, [subtitle, "" if backends else FASTEST, "crosses: not known to be reached"])),
     )  # fmt: skip
 

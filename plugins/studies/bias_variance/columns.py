@@ -74,6 +74,8 @@ COLUMNS = Columns.ordered(
     text("shapes", "hashes of the requested programs", table=False, measured=True),
     numbers("point", "theta at which the gradient is taken, by coordinate", table=False),
     text("descent_path", "the descent: JSON of lists of share, norm of theta, cost, gradient norm, largest speed and largest move", table=False),
+    *bounded("cost", "mean cost of the rollouts of the first estimate, where the estimator uses costs", table=False, has_csv=False,
+             of="the range of 95% of these costs"),
     numbers("mean_estimate", "mean estimate, signed, by coordinate of theta", table=False),
     Column("reference_spacing", "average spacing of the points of a reference by quadrature, in standard deviations of the noise",
            table=False),

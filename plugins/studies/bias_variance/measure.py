@@ -190,6 +190,8 @@ def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]
         "reference_gradient": truth.gradient.tolist(),
         "auxiliaries": auxiliaries,
     }
+    if "value" in cell.estimator.needs:
+        result |= costs_of(problem, next(estimates.parts(0)))
     if cell.point is not None:
         result |= {"start_norm": cell.point.start_norm, "descent_path": json.dumps(cell.point.along)}
     result |= against_reference(problem, cell.estimator, truth, values, cell.samples, estimates.sums, auxiliaries)
@@ -197,6 +199,13 @@ def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]
     if bad.any() and truth.is_finite:
         result["reason"] += f"; {locate_first_bad(cell, problem, estimates, int(np.argmax(bad)))}"
     return result
+
+
+def costs_of(problem: Problem, w: np.ndarray) -> dict[str, float]:
+    """Return the columns of the costs at theta with noise ``w (n_w, b)``: mean, and the range of 95% of them."""
+    costs = problem.value(problem.program.theta0, w)
+    low, high = np.quantile(costs, (0.025, 0.975))
+    return {"cost": float(costs.mean()), "cost_low": float(low), "cost_high": float(high)}
 
 
 def summarise_diagnostics(diagnostics: list[Auxiliaries]) -> str:

@@ -343,8 +343,7 @@ def charts(runs: RunSet) -> list[Chart]:
     """Return the share of targets that each method reaches, the largest first, and that single searches reach in time."""
     problems, times = runs.rows["problem"].unique(), hits(runs)
     where = f"{len(problems)} problems" if len(problems) > 1 else problems[0]
-    # a method without an estimator has no comma, and a free colour
-    looks = method_styles(method for method in runs.rows["method"].unique() if ", " in method)
+    looks = method_styles(runs.rows["method"].unique())
     targets = Chart(
         "targets", summarise(runs).sort_values("reached", ascending=False, kind="stable"), [REACHED], [METHOD], "dots",
         series="method", styles=looks, height=0.24, text="Bars are 95% intervals over scenes, or over seeds of one.",

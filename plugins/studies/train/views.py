@@ -290,8 +290,9 @@ def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
         "train", frame.dropna(subset=["step"]), [STEP], [cost], series="method", panel="problem", band=True,
         subtitle=f"cost: minus the return; {SEEDS}", text="A line per trainer, at its evaluations.",
     )  # fmt: skip
+    final = windows.assign(cost=-windows["final"], cost_low=-windows["final_high"], cost_high=-windows["final_low"])
     lengths = Chart(
-        "windows", windows, [replace(WINDOW, log=True)], [FINAL, WINDOW_BIAS, WINDOW_GRADIENT], series="family", panel="problem",
-        subtitle=f"final return: {SEEDS}", text="A point per length of window.",
+        "windows", final, [replace(WINDOW, log=True)], [cost, WINDOW_BIAS, WINDOW_GRADIENT], series="family", panel="problem",
+        subtitle=f"after training; cost: minus the return; {SEEDS}", text="A point per length of window.",
     )  # fmt: skip
     return [replace(one, styles=method_styles(one.frame[one.series].unique())) for one in (curves, lengths)]
