@@ -43,7 +43,7 @@ def run(experiment: str | Sequence[str] = (), **settings: Any) -> pd.DataFrame:
     texts = {key: value if isinstance(value, str) else config.as_json(key, value) for key, value in settings.items()}
     given = [*words, *(f"{key}={text}" for key, text in texts.items())]
     rows = finish(finished, given)[0] if resolved.execution.shard is None else finished.rows()
-    return with_axes(resolved.sweep, rows).reset_index(drop=True)
+    return with_axes(resolved.whole_sweep, rows).reset_index(drop=True)
 
 
 def load(directory: str | Path) -> pd.DataFrame:

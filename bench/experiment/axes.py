@@ -155,7 +155,7 @@ def with_axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> pd.DataFrame:
 
 def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows with the columns of the CSV: the study's table, the swept axes, ``study`` and ``parameters``."""
-    wide = with_axes(experiment.sweep, rows)
+    wide = with_axes(experiment.whole_sweep, rows)
     extra = [name for name in wide if name not in rows]
     wide = wide.reindex(columns=[*experiment.columns.table, *extra, "study", "parameters"])
     texts = [name for name in experiment.columns.of_kind("text") if name in wide]

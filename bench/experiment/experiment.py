@@ -114,6 +114,11 @@ class Experiment:
         """Folder of the experiment's files."""
         return self.results_dir / self.name
 
+    @property
+    def whole_sweep(self) -> Mapping[str, Any]:
+        """The sweep together with those of the parts that ``also`` names."""
+        return {"union": [one.sweep for one in (self, *self.also)]} if self.also else self.sweep
+
     def record(self) -> dict[str, Any]:
         """Return the whole experiment as JSON-like values, for ``run.json``."""
         return {

@@ -69,7 +69,7 @@ class Arranged:
 
 def arrange(experiment: Experiment, rows: pd.DataFrame) -> Arranged:
     """Return an experiment's rows arranged for reading: with a column per swept axis, and shorter labels."""
-    swept_axes = axes(experiment.sweep, rows)
+    swept_axes = axes(experiment.whole_sweep, rows)
     table = relabel(rows, swept_axes)
     for axis in swept_axes:
         if axis.column not in rows:

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import pandas as pd
 import pytest
 from bench.plugins.studies.bias_variance.columns import COLUMNS
 
@@ -10,6 +11,7 @@ from bench.cli import main
 from bench.errors import UserError
 from bench.experiment import config, grid
 from bench.experiment.keys import fingerprint
+from bench.report.views import arrange
 from bench.run import plan, tasks
 from bench.run.store import Store
 
@@ -152,6 +154,16 @@ def test_cells_of_an_experiment_that_joins_have_their_own_contact_law_and_the_se
     assert {cell.samples for cell in found} == {8}
     alone = grid.cells(config.load(["experiment=other", "samples=8", "also=[]"], folders))
     assert [cell.key for cell in found[1:]] == [cell.key for cell in alone]
+
+
+def test_an_axis_of_an_experiment_that_joins_is_an_axis_of_the_report(tmp_path):
+    parts = {
+        "main": [*OWN, "also: [other]", "sweep: {sigma: [0.1]}"],
+        "other": [*OTHER, "sweep: {damping: [0.1, 0.2]}"],
+    }
+    experiment = config.load(["experiment=main"], folder_with(tmp_path, **parts))
+    rows = pd.DataFrame([tasks.blank_row(experiment, cell) for cell in grid.cells(experiment)])
+    assert {"sigma", "damping"} <= {axis.column for axis in arrange(experiment, rows).axes}
 
 
 def test_an_experiment_of_another_study_cannot_join(tmp_path):

@@ -77,6 +77,19 @@ def test_seeds_choose_only_where_enough_are_left_for_a_test(count, reported):
     assert summary["final_low"].notna().all()
 
 
+@pytest.mark.parametrize(
+    ("own", "verdict"), [(-500.0, "not chosen"), (-300.0, "not run")], ids=["worse", "better than the reported"]
+)
+def test_a_setting_with_only_the_seeds_that_choose_counts_as_tried(own, verdict):
+    experiment, rows = made_up({"shac": -400.0, "shac[window=8]": own, "ppo": -900.0}, range(9), spread=1.0)
+    rows = rows[(rows["trainer"] != "shac[window=8]") | (rows["seed"] < 3)]
+    summary = tables_of(experiment, rows)["summary"].frame.set_index("method")
+    assert summary.loc["shac[window=8]", "verdict"] == verdict
+    assert summary.loc["shac", "settings"] == 2
+    assert np.isnan(summary.loc["shac[window=8]", "final"])
+    assert summary.loc["shac[window=8]", "tuned"] == pytest.approx(own, abs=3.0)
+
+
 def test_a_setting_without_a_tuning_run_is_not_chosen():
     experiment, rows = made_up({"shac": -400.0, "shac[window=8]": -500.0, "ppo": -900.0}, range(9), spread=1.0)
     rows = rows[(rows["trainer"] != "shac[window=8]") | (rows["seed"] >= 3)]

@@ -31,6 +31,7 @@ PROBLEM, METHOD, VERDICT = text("problem"), text("method", label="trainer"), tex
 FINAL = interval("final", label="final return", digits=3, log=False)
 SUMMARY = (
     PROBLEM, METHOD, FINAL, VERDICT, Column("settings", format="setting"),
+    Column("tuned", label="at the choosing seeds", digits=3, log=False),
     Column("worst", label="worst seed", digits=3), Column("seeds", format="setting"),
     Column("failed", label="not finite", format="setting"), Column("steps", unit="steps", label="control steps", digits=3),
     Column("used", label="used steps", digits=3),
@@ -74,10 +75,11 @@ WINDOW_NOTE = (
 )
 FAULT_NOTE = "update: where it starts. value:"
 VERDICTS = (
-    "settings: how many of the trainer were tried. The best on the first third of the seeds is chosen, the other seeds are reported; "
-    "of fewer than 8 seeds all are reported, and choose. "
+    "settings: how many of the trainer were tried. The best on the first third of the seeds (the choosing seeds) is chosen, the other "
+    "seeds are reported; of fewer than 8 seeds all are reported, and choose. "
     "verdict: first, tied (not distinguishable), behind (by a Mann-Whitney test at 5%), not chosen, or open: none is behind, or only "
-    "the first's larger number of settings puts it ahead (it would lead with the worst of as many settings)."
+    "the first's larger number of settings puts it ahead (it would lead with the worst of as many settings). not run: chosen, but "
+    "without reported seeds."
 )
 WINDOW_VERDICTS = (
     "verdict: first, tied (not distinguishable), behind (by a Mann-Whitney test at 5%), or open where none is behind."
@@ -162,11 +164,17 @@ def split(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 
 def tried(lines: pd.DataFrame, tuning: pd.DataFrame) -> pd.DataFrame:
-    """Return lines of :func:`summarise` with each trainer's number of ``settings``, and ``tuned``: the returns that choose one."""
-    returns = {key: interquartile_mean(final_returns(part)) for key, part in tuning.groupby(["problem", "method"])}
-    keys = zip(lines["problem"], lines["method"], strict=True)
-    settings = lines.groupby(["problem", "family"])["method"].transform("size")
-    return lines.assign(settings=settings, tuned=[returns.get(key, -math.inf) for key in keys])
+    """Return lines of :func:`summarise` with each trainer's number of ``settings``, and ``tuned``: the return that chooses one.
+
+    A setting that has only the seeds that choose is a line without a ``final`` return.
+    """
+    keys = ["problem", "family", "method"]
+    middles = [(*key, interquartile_mean(final_returns(part))) for key, part in tuning.groupby(keys)]
+    lines = lines.merge(pd.DataFrame(middles, columns=[*keys, "tuned"]), how="outer", on=keys)
+    lines["settings"] = lines.groupby(keys[:2])["method"].transform("size")
+    return lines.sort_values(
+        ["problem", "final", "tuned"], ascending=[True, False, False], kind="stable", ignore_index=True
+    )
 
 
 def ranked(lines: pd.DataFrame, by: Sequence[str], trainer: str = "family") -> pd.Series:
@@ -174,19 +182,26 @@ def ranked(lines: pd.DataFrame, by: Sequence[str], trainer: str = "family") -> p
 
     ``first``: the highest return; ``behind``: its runs end lower than those of the first, by the test of Mann and Whitney (1947)
     at 5%, even if the first had only its worst settings, as many as this one; ``tied``: the test finds no difference;
-    ``open``: neither, or none of the group is behind; ``no result``: no run ended with a finite return.
+    ``open``: neither, or none of the group is behind; ``not run``: the chosen setting has no seeds that are reported;
+    ``no result``: no run ended with a finite return.
     """
     verdicts = pd.Series("no result", lines.index, dtype=object)
-    has_ended = np.isfinite(lines["final"]) & (lines["failed"] < lines["seeds"])
-    for _, part in lines[has_ended].sort_values("tuned", ascending=False, kind="stable").groupby(list(by), sort=False):
+    is_run, has_ended = lines["seeds"] > 0, np.isfinite(lines["final"]) & (lines["failed"] < lines["seeds"])
+    compared = lines[has_ended | ~is_run].sort_values("tuned", ascending=False, kind="stable", na_position="last")
+    for _, part in compared.groupby(list(by), sort=False):
         verdicts[part.index] = "not chosen"
         settings, chosen = dict(iter(part.groupby(trainer)["returns"])), part.drop_duplicates(trainer)
+        verdicts[chosen.index[~is_run[chosen.index]]] = "not run"
+        chosen = chosen[is_run[chosen.index]]
+        if chosen.empty:
+            continue
         best = chosen.loc[chosen["final"].idxmax()]
         own = settings[best[trainer]]
         for index, line in chosen.iterrows():
             fewest = own.iloc[max(len(own) - len(settings[line[trainer]]), 0)]
             leads = is_lower(line["returns"], best["returns"])
-            verdicts[index] = ("behind" if is_lower(line["returns"], fewest) else "open") if leads else "tied"
+            leads_by_fewer = isinstance(fewest, np.ndarray) and is_lower(line["returns"], fewest)
+            verdicts[index] = ("behind" if leads_by_fewer else "open") if leads else "tied"
         verdicts[best.name] = "first"
         if len(chosen) > 1 and not (verdicts[chosen.index] == "behind").any():
             verdicts[chosen.index] = "open"
@@ -263,7 +278,9 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
         return None
     tuning, reported = split(runs)
     summary, windows, faults = tried(summarise(reported), tuning), windows_of(runs), faults_of(runs)
-    summary = summary.assign(verdict=ranked(summary, ["problem"])).drop(columns=["returns", "tuned", *OF_WINDOWS])
+    summary = summary.assign(verdict=ranked(summary, ["problem"])).drop(columns=["returns", *OF_WINDOWS])
+    chosen = summary[~summary["verdict"].isin(["not chosen", "not run"])].set_index(["problem", "method"]).index
+    shown = reported[pd.MultiIndex.from_frame(reported[["problem", "method"]]).isin(chosen)]
     tables = [
         Table("train", summary, SUMMARY, "final return by trainer", [NOTE, VERDICTS], terminal=True, page=True, data=table(experiment, rows),
               details=["compile_s", "gradient_typical", "gradient_peak"]),
@@ -279,7 +296,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
         tables.append(Table("faults", faults, FAULTS, "Faults in the logs", notes, page=True))
     cells = rows.assign(problem=runs["problem"], method=runs["method"]).fillna({"problem": "", "method": ""})
     by_name = experiment.columns.by_name
-    return Views(tables, _charts(runs, windows), cells,
+    return Views(tables, _charts(shown, windows), cells,
                  [METHOD, *(by_name[name] for name in PAGE)])  # fmt: skip
 
 
@@ -288,7 +305,7 @@ def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
     cost = replace(COST, log=bool((frame["cost"] > 0).all()))
     curves = Chart(
         "train", frame.dropna(subset=["step"]), [STEP], [cost], series="method", panel="problem", band=True,
-        subtitle=f"cost: minus the return; {SEEDS}", text="A line per trainer, at its evaluations.",
+        subtitle=f"cost: minus the return; {SEEDS}", text="A line per trainer with its chosen setting, at its evaluations.",
     )  # fmt: skip
     final = windows.assign(cost=-windows["final"], cost_low=-windows["final_high"], cost_high=-windows["final_low"])
     lengths = Chart(
