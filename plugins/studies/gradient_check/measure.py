@@ -73,31 +73,14 @@ def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, An
     reached = [Place("noise", 0, 1, theta, along, event.w, verdict=event.verdict) for event in events]
     found = examine(problem, drawn, directions, unit, search, reached)
     points = [*at_start(whole), *(_settled(problem, point) for point in found)]
-    checks: list[dict[str, Any]] = [
-        {
-            "point": point.place.point, "sample": point.place.noise, "direction": point.place.number,
-            "contact_switch": point.place.switch, "derivative_program": point.sample.derivative, "check_verdict": point.verdict,
-            "check_error": float(point.sample.errors[best]), "check_eps": float(gradcheck.EPS[best]),
-        }
-        for point in points for best in [gradcheck.best(point.sample)]
-    ]  # fmt: skip
-    severest = min(checks, key=lambda check: (gradcheck.VERDICTS.index(check["check_verdict"]), -check["check_error"]))
-    untrusted = sum(not is_trusted(point.place.point, point.verdict) for point in points)
-    spread = sampled.spread / math.sqrt(cell.samples)
     lost = all(point.verdict == "nonfinite" for point in points)
-    parts = whole.components
     remarks = [SURROGATE] if problem.program.surrogate else []
     remarks += [] if whole.cause in PLAIN else [whole.sentence()]
     remarks += [event.remark for event in events]
     return {
         "status": "nonfinite" if lost else "ok",
         "reason": "no cost is finite" if lost else "; ".join([*remarks, *beyond_stability(cell)]),
-        "verdict": severest["check_verdict"],
-        "untrusted": untrusted,
-        "spread": spread,
-        "trusted": "no" if untrusted or not spread < SPREAD else "yes",
-        "best_error": severest["check_error"],
-        "best_eps": severest["check_eps"],
+        **_checks(points, sampled.spread / math.sqrt(cell.samples)),
         "scale": scale_of(theta),
         "taylor_order": whole.order,
         "jump": jump.height,
@@ -105,9 +88,33 @@ def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, An
         "jump_distance": distance,
         "cost_noise": whole.noise,
         "device": problem.device,
-        "component": [part.component for part in parts],
-        **{f"component_{name}": [getattr(part, name) for part in parts] for name in PER_COMPONENT},
-        **{name: [check[name] for check in checks] for name in checks[0]},
+        "component": [part.component for part in whole.components],
+        **{f"component_{name}": [getattr(part, name) for part in whole.components] for name in PER_COMPONENT},
+    }
+
+
+def _checks(points: list[Point], spread: float) -> dict[str, Any]:
+    """Return the columns of the checked points, and the verdict of all, for samples of that relative ``spread``."""
+    best = [gradcheck.best(point.sample) for point in points]
+    errors = [float(point.sample.errors[k]) for point, k in zip(points, best, strict=True)]
+    steps = [float(gradcheck.EPS[k]) for k in best]
+    severest = min(range(len(points)), key=lambda i: (gradcheck.VERDICTS.index(points[i].verdict), -errors[i]))
+    untrusted = sum(not is_trusted(point.place.point, point.verdict) for point in points)
+    return {
+        "verdict": points[severest].verdict,
+        "untrusted": untrusted,
+        "spread": spread,
+        "trusted": "no" if untrusted or not spread < SPREAD else "yes",
+        "best_error": errors[severest],
+        "best_eps": steps[severest],
+        "point": [point.place.point for point in points],
+        "sample": [point.place.noise for point in points],
+        "direction": [point.place.number for point in points],
+        "contact_switch": [point.place.switch for point in points],
+        "derivative_program": [point.sample.derivative for point in points],
+        "check_verdict": [point.verdict for point in points],
+        "check_error": errors,
+        "check_eps": steps,
         "eps": gradcheck.EPS.tolist(),
         "derivative_differences": np.concatenate([point.sample.differences for point in points]).tolist(),
         "relative_error": np.concatenate([point.sample.errors for point in points]).tolist(),
