@@ -16,7 +16,7 @@ skewness by transformation).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -419,13 +419,7 @@ def summarise(
     Raises ValueError for shapes that do not fit. Estimates that are not finite do not raise: see :class:`Summary`.
     """
     estimates = np.asarray(estimates, dtype=np.float64)
-    if estimates.ndim != 2 or len(estimates) < 1 or estimates.shape[1:] != truth.mean.shape:
-        raise ValueError(
-            f"estimates have the shape (R, {truth.mean.size}) with R > 0, as the reference has "
-            f"{truth.mean.size} coordinates; given {estimates.shape}"
-        )
-    if samples < 1:
-        raise ValueError(f"an estimate is made of one sample or more; given {samples}")
+    _check_shapes(estimates, truth, samples)
     repeats = len(estimates)
     finite = int(np.isfinite(estimates).all(axis=1).sum())
     if finite < repeats:
@@ -438,38 +432,32 @@ def summarise(
     identical = bool((np.abs(estimates - estimates[0]) <= ROUNDING * np.abs(estimates[0])).all())
     mean = estimates[0] if identical else estimates.mean(axis=0)
     deviations = np.zeros_like(estimates) if identical else estimates - mean
-    norm, grad_norm = reference.norm, float(np.linalg.norm(mean))
     is_fixed = identical and repeats > 1 and not is_random
     missed = THREE / (repeats * samples) if identical and not is_fixed else 0.0
     bias, variance = _spread(deviations, mean, reference, samples, missed)
     error = float(rmse(bias[0], variance[0]))
-    relative = math.nan if norm <= ROUNDING or reference.vanishes() else norm
+    relative = math.nan if reference.norm <= ROUNDING or reference.vanishes() else reference.norm
     cosine, signs = _directions(estimates, reference.mean)
     notes = [] if is_fixed else _interval_remarks(deviations, mean - reference.mean, missed)
     notes += _reference_remarks(reference, relative)
     if unbiased and bias[1] > 0.0:
         notes.append(f"declared unbiased, and its interval excludes 0: {UNEXPLAINED}, or chance (about 1 row in 30)")
-    scaled = tuple(value * samples * unit * unit for value in variance)
+    per_sample = _ends("variance_per_sample", [value * samples * unit * unit for value in variance])
     if terms is not None:
-        scaled = variance_per_sample(*terms, samples)
+        value, low, high = variance_per_sample(*terms, samples)
+        per_sample = _ends("variance_per_sample", (value, low, high))
         # width of the interval of the log variance of terms, times their number, below which it ignores the
         # error of their mean
-        if scaled[1] > 0.0 and math.log(scaled[2] / scaled[1]) < 10.0 / (repeats * samples):
+        if low > 0.0 and math.log(high / low) < 10.0 / (repeats * samples):
             notes.append("all terms are equally far from their mean: the interval of their variance is too narrow")
     return Summary(
-        grad_norm=grad_norm * unit,
-        reference_norm=norm * unit,
+        grad_norm=float(np.linalg.norm(mean)) * unit,
+        reference_norm=reference.norm * unit,
         reference_se=reference.standard_error * unit,
-        bias=bias[0] * unit,
-        bias_low=bias[1] * unit,
-        bias_high=bias[2] * unit,
+        **_ends("bias", [value * unit for value in bias]),
         bias_rel=bias[0] / relative,
-        variance=variance[0] * unit * unit,
-        variance_low=variance[1] * unit * unit,
-        variance_high=variance[2] * unit * unit,
-        variance_per_sample=scaled[0],
-        variance_per_sample_low=scaled[1],
-        variance_per_sample_high=scaled[2],
+        **_ends("variance", [value * unit * unit for value in variance]),
+        **per_sample,
         rmse=error * unit,
         rmse_rel=error / relative,
         cosine=cosine,
@@ -477,6 +465,22 @@ def summarise(
         finite_fraction=1.0,
         note="; ".join(notes),
     )
+
+
+def _check_shapes(estimates: np.ndarray, truth: Truth, samples: int) -> None:
+    """Raise ValueError for estimates that are not those of the truth's gradient, or of no sample."""
+    if estimates.ndim != 2 or len(estimates) < 1 or estimates.shape[1:] != truth.mean.shape:
+        raise ValueError(
+            f"estimates have the shape (R, {truth.mean.size}) with R > 0, as the reference has "
+            f"{truth.mean.size} coordinates; given {estimates.shape}"
+        )
+    if samples < 1:
+        raise ValueError(f"an estimate is made of one sample or more; given {samples}")
+
+
+def _ends(name: str, values: Iterable[float]) -> dict[str, Any]:
+    """Return the fields of a number and of the ends of its interval."""
+    return dict(zip((name, f"{name}_low", f"{name}_high"), values, strict=True))
 
 
 def _spread(
