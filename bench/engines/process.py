@@ -22,7 +22,7 @@ import numpy as np
 
 from bench.engines import server
 from bench.errors import Crashed, Unavailable, Unsupported, printable
-from bench.model import guard
+from bench.host import guard
 
 TAIL = 2000
 """Bytes of an engine's last output that a message quotes."""
