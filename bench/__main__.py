@@ -35,7 +35,8 @@ def command() -> None:
         os._exit(_watched())  # without waiting for threads
     from bench.cli import main
     from bench.errors import failure
-    from bench.model import guard, registry
+    from bench.host import guard
+    from bench.model import registry
 
     descriptor, parent = map(int, channel.split())
     os.set_inheritable(descriptor, False)

@@ -14,10 +14,10 @@ import numpy as np
 
 from bench.errors import Unsupported, UserError, failure
 from bench.experiment.by_name import compile_problem, make
+from bench.host.identity import label, text_of
+from bench.host.parameters import build, parameters, singular
+from bench.host.parameters import values as parameter_values
 from bench.model import Backend, Decision, Estimator, Integrator, Problem, Scene, registry
-from bench.model.identity import label, text_of
-from bench.model.parameters import build, parameters, singular
-from bench.model.parameters import values as parameter_values
 from bench.notebook import Estimates
 
 if TYPE_CHECKING:

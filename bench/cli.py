@@ -327,8 +327,8 @@ def _list(words: list[str]) -> int:
 
     from bench.api import described, matching_plugins
     from bench.experiment.words import parse_words
-    from bench.model.identity import text_of
-    from bench.model.parameters import parameters
+    from bench.host.identity import text_of
+    from bench.host.parameters import parameters
 
     names, _, _ = parse_words(words, "list", {})
     for kind, listed in matching_plugins(names).items():
@@ -424,7 +424,7 @@ def _gradcheck(words: list[str]) -> int:
     from dataclasses import replace
 
     from bench.experiment.study import study_of
-    from bench.model.parameters import parameters
+    from bench.host.parameters import parameters
 
     scenes, settings = _split_scenes(words, "gradcheck")
     _refer("gradcheck", words[: len(words) - len(settings)])

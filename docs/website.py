@@ -18,8 +18,8 @@ from bench.plugins.studies.bias_variance.comparisons import FAILS, OPEN
 import bench
 import bench.plugin
 from bench.errors import UserError
+from bench.host.parameters import parameters
 from bench.model import registry
-from bench.model.parameters import parameters
 from bench.report.tables import escape_markdown
 from bench.report.text import number
 from docs.figures import without_marks

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 from browser import CHROMIUM, MISSING, chromium
 
-from bench.model import registry, trial
+from bench.host import trial
+from bench.model import registry
 
 QUICK = (
     "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true "

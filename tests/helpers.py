@@ -17,9 +17,9 @@ from bench.experiment import config
 from bench.experiment.columns import IDENTITY
 from bench.experiment.experiment import Experiment
 from bench.experiment.grid import cells
+from bench.host.identity import parse_identity
+from bench.host.parameters import parameters
 from bench.model import registry
-from bench.model.identity import parse_identity
-from bench.model.parameters import parameters
 from bench.report import writer
 from bench.report.finish import views_of
 from bench.report.views import newest_rows

@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 BENCH = ROOT / "bench"
 LAYERS = [
     ["errors"],
-    ["simulator"],
+    ["simulator", "host"],
     ["model"],
     ["engines"],
     ["measure", "plugins"],

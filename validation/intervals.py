@@ -24,10 +24,10 @@ from bench.plugins.estimators.randomized_smoothing import RandomizedSmoothing
 from bench.plugins.estimators.reinforce import Reinforce
 from bench.plugins.studies.bias_variance.measure import summarise_diagnostics
 
+from bench.host.identity import label
 from bench.measure.noise import samples_of
 from bench.measure.statistics import Truth, summarise
 from bench.model import IID, SampleMean, Unsupported, columns, compose, per_repeat, registry
-from bench.model.identity import label
 from bench.report.views import rmse_interval
 
 LEAST, MOST = 0.91, 0.99

@@ -19,7 +19,7 @@ from helpers import loaded
 from bench.compare import cells
 from bench.model import Problem, registry
 from bench.run import tasks
-from bench.run.session import Session
+from bench.run.session import RunSession
 
 SHORT = ("pushing", "cartpole", "double_pendulum", "pendulum", "hopper", "friction_block", "tossed_box", "mass_spring", "ground_wall", "bouncing_ball")  # fmt: skip
 """Scenes whose horizon is set to ten steps."""
@@ -77,7 +77,7 @@ def rows(scene, fault):
     more = [f"scene.{scene}.horizon=10"] if scene in SHORT else []
     made, found = loaded(f"scenes=[{scene}]", *WORDS, *more)
     with planted(fault):
-        session = Session(made)
+        session = RunSession(made)
         table = []
         for cell in found:
             refused = cell.refusal()

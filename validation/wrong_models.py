@@ -17,11 +17,12 @@ from bench.plugins.integrators.rk4 import Rk4
 from bench.plugins.optimizers.gauss_newton import GaussNewton
 from bench.plugins.scenes.mass_spring_damper import MassSpringDamper
 from bench.plugins.scenes.pendulum import Pendulum
+from bench.plugins.studies.identify import adequacy
 from bench.plugins.studies.identify.measure import Fitting, Model, information, missing_terms, run_fits
 from bench.plugins.studies.identify.record import evaluate
 from scipy.stats import norm
 
-from bench.measure import adequacy, performance
+from bench.measure import performance
 from bench.model import Decision, compose
 
 SIGMA, STEPS = 0.01, 200

@@ -10,8 +10,8 @@ import numpy as np
 
 from bench.errors import Unsupported
 from bench.experiment.by_name import compile_problem, make
+from bench.host.identity import parse_identity
 from bench.model import Answer, Array, Estimator, FunctionScene, Optimizer, Problem, SampleMean, Scene
-from bench.model.identity import parse_identity
 
 used: set[tuple[str, str]] = set()
 """Kind and name of the plugins built since the set was cleared. The numbers of a claim depend on them."""

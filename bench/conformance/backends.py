@@ -35,6 +35,7 @@ from bench.conformance.subjects import (
 from bench.engines.backend import EngineBackend
 from bench.gradient import EPS, FAULTS, TRUSTED, Check, Options, check, judge, sampled
 from bench.gradient.direction import SINGLE_EPS
+from bench.host.parameters import parameters
 from bench.model import (
     Array,
     Backend,
@@ -52,7 +53,6 @@ from bench.model import (
     param,
 )
 from bench.model.backend import CAPABILITIES
-from bench.model.parameters import parameters
 
 COMPUTED = frozenset({"value", "grad", "score"})
 """Capabilities that return a number per column."""

@@ -11,6 +11,7 @@ import numpy as np
 from bench.conformance.kit import require, skip_unless, verifies
 from bench.conformance.subjects import NewtonOps, law_for, rng, sound_laws, sound_scenes, stepping
 from bench.errors import UserError
+from bench.host.parameters import traced
 from bench.model import (
     CallableScene,
     ContactLaw,
@@ -21,7 +22,6 @@ from bench.model import (
     Scene,
     compose,
 )
-from bench.model.parameters import traced
 
 COLUMNS = 16
 """Thetas, each with its noise, at which costs are compared."""

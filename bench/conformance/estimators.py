@@ -23,6 +23,8 @@ from bench.conformance.subjects import (
     standard_errors,
     stepping,
 )
+from bench.host.identity import identity
+from bench.host.parameters import parameters
 from bench.measure import noise
 from bench.model import (
     Design,
@@ -36,8 +38,6 @@ from bench.model import (
     compose,
 )
 from bench.model.estimator import require_shape
-from bench.model.identity import identity
-from bench.model.parameters import parameters
 
 SIGMAS = (0.1, 0.5)
 """Noise levels of the oracles. 1 is excluded, because sigma and its square would be equal."""

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from bench.conformance.kit import Failed, require, variants, verifies
 from bench.errors import printable
+from bench.host.parameters import build, check, parameters
 from bench.model import Plugin, registry
-from bench.model.parameters import build, check, parameters
 
 
 @verifies(Plugin)

@@ -13,9 +13,9 @@ from typing import Any
 
 from bench.engines.backend import EngineBackend
 from bench.errors import UserError, printable, unknown
+from bench.host.identity import identity
+from bench.host.parameters import build, parameters
 from bench.model import Estimator, Plugin, registry
-from bench.model.identity import identity
-from bench.model.parameters import build, parameters
 from bench.simulator.clock import parse_duration
 
 

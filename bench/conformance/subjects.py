@@ -14,6 +14,7 @@ import numpy as np
 
 from bench.conformance.kit import Skipped, missing_environment, require, skip_unless
 from bench.engines.backend import EngineBackend
+from bench.host.parameters import build, parameters
 from bench.measure import jumps
 from bench.model import (
     Array,
@@ -32,7 +33,6 @@ from bench.model import (
     compose,
     registry,
 )
-from bench.model.parameters import build, parameters
 
 LIMIT = 4.5
 """Allowed difference of a sample mean from its expectation, in standard errors."""

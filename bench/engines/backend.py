@@ -11,8 +11,8 @@ from bench.engines import environments, server, twin
 from bench.engines.problem import EngineProblem
 from bench.engines.process import EngineModel
 from bench.errors import Unavailable, Unsupported
+from bench.host.parameters import values
 from bench.model import Backend, EngineTwin, MechanicalScene, Problem, Program, adjoint, param
-from bench.model.parameters import values
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bench.errors import Unavailable, UserError, printable
-from bench.model.parameters import remember
+from bench.host.parameters import remember
 
 FOLDER = "BENCH_ENGINES"
 """Environment variable with the folder that contains the environments."""

@@ -20,7 +20,7 @@ from bench.experiment.parameters import (
     parsed,
     plugin_class,
 )
-from bench.model.parameters import parameters
+from bench.host.parameters import parameters
 
 if TYPE_CHECKING:
     import pandas as pd

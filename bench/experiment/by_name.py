@@ -7,6 +7,8 @@ from typing import Any
 
 from bench.errors import Unsupported
 from bench.experiment.reference_backends import capable_backends
+from bench.host.identity import parse_identity
+from bench.host.parameters import build, parameters, singular
 from bench.model import (
     Backend,
     ContactLaw,
@@ -18,8 +20,6 @@ from bench.model import (
     compose,
     registry,
 )
-from bench.model.identity import parse_identity
-from bench.model.parameters import build, parameters, singular
 
 
 def make(kind: str, identity: str, defaults: Mapping[str, Any] | None = None) -> Any:

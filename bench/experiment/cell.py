@@ -16,8 +16,10 @@ from bench.experiment.experiment import Budget
 from bench.experiment.keys import COMPARED, SHARED, counted, fingerprint, hashed, raised, revisions_of
 from bench.experiment.parameters import labels
 from bench.experiment.reference_backends import capable_backends
+from bench.host.identity import described, identity
+from bench.host.parameters import parameters, singular, values
 from bench.measure import descent, reference
-from bench.measure.descent import Point
+from bench.measure.descent import DescentPoint
 from bench.model import (
     IID,
     Backend,
@@ -33,8 +35,6 @@ from bench.model import (
     compose,
     registry,
 )
-from bench.model.identity import described, identity
-from bench.model.parameters import parameters, singular, values
 from bench.model.program import OWN, idle
 
 DESCENDED = ("contact", "integrator", "backend")
@@ -62,7 +62,7 @@ class Cell:
     """Budget of its reference gradient; None if the study needs none."""
     path: Cell | None = None
     """The start of the descent that theta is on, with the program that is descended; None where nothing is descended."""
-    point: Point | None = None
+    point: DescentPoint | None = None
     """Theta on that descent; None before it is computed."""
     swept: tuple[str, ...] = ()
     """Parameters of its scene that are axes of the sweep."""

@@ -29,9 +29,10 @@ from bench.experiment.overrides import (
     with_ranges,
 )
 from bench.experiment.study import Study
-from bench.model import Decision, MechanicalScene, Plugin, guard, registry
-from bench.model.identity import parse_identity
-from bench.model.parameters import Parameter, build, check, coerce, parameters, remember, singular
+from bench.host import guard
+from bench.host.identity import parse_identity
+from bench.host.parameters import Parameter, build, check, coerce, parameters, remember, singular
+from bench.model import Decision, MechanicalScene, Plugin, registry
 
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 RESERVED = ("claims", "references", "standard", "trace")

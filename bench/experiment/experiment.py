@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from bench.experiment.columns import Columns
+from bench.host.identity import described, identity
+from bench.host.parameters import Plugin, param
+from bench.host.registry import Entry
 from bench.model import Decision, registry
-from bench.model.identity import described, identity
-from bench.model.parameters import Plugin, param
 from bench.model.program import OWN
-from bench.model.registry import Entry
 
 
 @dataclass(frozen=True)

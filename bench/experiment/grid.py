@@ -14,8 +14,8 @@ from bench.experiment.cell import DESCENDED, Cell
 from bench.experiment.experiment import Choice, Experiment
 from bench.experiment.parameters import DESCENT, THETA, applies
 from bench.experiment.study import study_of
+from bench.host.parameters import build, coerce, parameters, singular
 from bench.model import Decision, MechanicalScene, Plugin, compose
-from bench.model.parameters import build, coerce, parameters, singular
 from bench.model.program import OWN
 
 MAX_CELLS = 1_000_000

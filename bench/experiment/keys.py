@@ -17,9 +17,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from bench.host import reads
+from bench.host.parameters import Plugin, parameters, remember, values
 from bench.measure import noise, statistics
-from bench.model import PolicyScene, Scene, program, reads
-from bench.model.parameters import Plugin, parameters, remember, values
+from bench.model import PolicyScene, Scene, program
 
 SHARED = (noise, program)
 """Modules that decide the numbers of all cells."""

@@ -9,7 +9,7 @@ from typing import Any
 
 from bench.errors import UserError, printable
 from bench.experiment.grid import MAX_CELLS
-from bench.model.identity import split_items
+from bench.host.identity import split_items
 
 GLOBAL = "# @package _global_"
 """The first line of an experiment file, so that Hydra does not nest its settings."""

@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.experiment.experiment import Budget
+from bench.host.identity import identity, plain
+from bench.host.parameters import parameters, singular
 from bench.model import Decision, Plugin, registry
-from bench.model.identity import identity, plain
-from bench.model.parameters import parameters, singular
 
 if TYPE_CHECKING:
     import pandas as pd

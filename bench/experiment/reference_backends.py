@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from contextlib import suppress
 
+from bench.host.parameters import build, remember
 from bench.model import Backend, Problem, Program, registry
-from bench.model.parameters import build, remember
 
 
 def capable_backends(program: Program, for_references: bool = False) -> list[Backend]:

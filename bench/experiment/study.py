@@ -13,8 +13,8 @@ from bench.experiment.columns import Columns
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Views
+from bench.host.parameters import Plugin
 from bench.model import Decision, registry
-from bench.model.parameters import Plugin
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -26,17 +26,17 @@ WINDOW, ENOUGH = 10, 1e-3
 """A descent ends where this many steps have gained less than this share of its whole gain."""
 
 
-class Point(NamedTuple):
+class DescentPoint(NamedTuple):
     """A share of a descent: theta there, the norm of the gradient at its start, and what the path is like."""
 
     theta: tuple[float, ...]
     start_norm: float
     along: dict[str, list[float]]
-    """Lists, by share: ``share``, the norm of ``theta``, ``cost``, ``gradient``, ``speed`` and ``move``, see :class:`Descent`."""
+    """Lists, by share: ``share``, the norm of ``theta``, ``cost``, ``gradient``, ``speed`` and ``move``, see :class:`DescentPath`."""
 
 
 @dataclass(frozen=True)
-class Descent:
+class DescentPath:
     """A path of K thetas with falling costs, or the ``reason`` why there is none.
 
     ``thetas (K, d)``, and per theta J_sigma ``costs``, the norms ``gradients`` of its gradient, the largest ``speeds``
@@ -51,7 +51,7 @@ class Descent:
     moves: list[float]
     reason: str = ""
 
-    def at(self, share: float) -> Point:
+    def at(self, share: float) -> DescentPoint:
         """Return the point where this share of the gain in cost is reached, theta rounded to 6 significant digits.
 
         Values between two thetas of the path are interpolated. Raises :class:`Unsupported` with the reason if there is no
@@ -75,7 +75,7 @@ class Descent:
             **{name: between(getattr(self, f"{name}s")) for name in ("cost", "gradient", "speed", "move")},
         }
         # significant digits of thetas along a path
-        return Point(tuple(float(f"{value:.6g}") for value in theta), self.gradients[0], along)
+        return DescentPoint(tuple(float(f"{value:.6g}") for value in theta), self.gradients[0], along)
 
 
 class _Objective:
@@ -103,7 +103,7 @@ class _Objective:
 
 
 @dataclass
-class _Path:
+class _Steps:
     """The thetas of a descent so far, with their costs and gradients."""
 
     thetas: list[np.ndarray]
@@ -117,7 +117,7 @@ class _Path:
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def descend(problem: Problem) -> Descent:
+def descend(problem: Problem) -> DescentPath:
     """Return the descent of J_sigma from theta0 by gradient steps under common noise.
 
     A step that would raise the cost is halved. There is no descent where no optimum is reached.
@@ -147,12 +147,12 @@ def descend(problem: Problem) -> Descent:
     if not left < 0.5:
         return _none(f"no optimum in {taken}: the gradient there is {left:.2g} times that at theta0")
     thetas = np.array(path.thetas)
-    return Descent(thetas.tolist(), costs, norms, *_motion(problem, thetas))
+    return DescentPath(thetas.tolist(), costs, norms, *_motion(problem, thetas))
 
 
-def _followed(objective: _Objective, theta: np.ndarray, w: np.ndarray) -> tuple[_Path, bool]:
+def _followed(objective: _Objective, theta: np.ndarray, w: np.ndarray) -> tuple[_Steps, bool]:
     """Return the path from ``theta (d,)`` under noise ``w``, and whether it ends: False if the cost still falls."""
-    path = _Path([theta], [objective.cost(theta, w)], [objective.gradient(theta, w)])
+    path = _Steps([theta], [objective.cost(theta, w)], [objective.gradient(theta, w)])
     # the length of theta0, or that of the noise on all of theta if it is larger
     scale = max(float(np.linalg.norm(theta)), objective.problem.sigma * math.sqrt(theta.size))
     step = 0.0
@@ -178,8 +178,8 @@ def _followed(objective: _Objective, theta: np.ndarray, w: np.ndarray) -> tuple[
     return path, True
 
 
-def _none(reason: str) -> Descent:
-    return Descent([], [], [], [], [], reason)
+def _none(reason: str) -> DescentPath:
+    return DescentPath([], [], [], [], [], reason)
 
 
 def _pairs(problem: Problem, block: int) -> np.ndarray:

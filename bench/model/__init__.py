@@ -10,6 +10,8 @@ traced value, so Python code must not branch on it. All other types are static.
 """
 
 from bench.errors import Unsupported, UserError, unknown
+from bench.host import registry
+from bench.host.parameters import Plugin, param
 from bench.model import adjoint
 from bench.model.adjoint import Slopes, by_actions, by_theta, slopes, slopes_along
 from bench.model.adjoint import gradient as adjoint_gradient
@@ -41,7 +43,6 @@ from bench.model.known_solutions import Identified, KnownOptimum, KnownValue
 from bench.model.manifold import JointScene, difference, n_changes, retract, slope_by_changes
 from bench.model.ops import Array, LoopOps, Ops, State, stopped
 from bench.model.optimizer import Answer, Descent, Optimizer, OptimizerState, Population
-from bench.model.parameters import Plugin, param
 from bench.model.policy import Policy, PolicyScene, affine, uniform
 from bench.model.problem import Compilations, Executable, Jacobians, Problem, Trajectory
 from bench.model.program import (
@@ -158,6 +159,7 @@ __all__ = [
     "param",
     "per_repeat",
     "per_unit",
+    "registry",
     "retract",
     "rollout",
     "simulator_files",

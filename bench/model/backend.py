@@ -6,7 +6,7 @@ from abc import abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
-from bench.model.parameters import Plugin, param
+from bench.host.parameters import Plugin, param
 from bench.model.problem import Problem
 from bench.model.program import Program
 

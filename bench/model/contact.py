@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
+from bench.host.parameters import Plugin
 from bench.model.ops import Array, Ops, State
-from bench.model.parameters import Plugin
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from bench.errors import Unsupported
+from bench.host.parameters import Plugin, param
 from bench.model.design import (
     IID,
     LEAST_UNITS,
@@ -23,7 +24,6 @@ from bench.model.design import (
     per_unit,
     sums_of_units,
 )
-from bench.model.parameters import Plugin, param
 from bench.model.problem import Problem
 from bench.model.program import Program
 

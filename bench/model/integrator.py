@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from bench.host.parameters import Plugin
 from bench.model.dynamics import Dynamics
 from bench.model.ops import Array, State
-from bench.model.parameters import Plugin
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from bench.host.parameters import Plugin
 from bench.model.contact import ContactLaw
-from bench.model.parameters import Plugin
 
 
 class KnownOptimum(ABC):

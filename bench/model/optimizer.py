@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from bench.model.parameters import Plugin, param
+from bench.host.parameters import Plugin, param
 
 OptimizerState = dict[str, Any]
 """The complete state of an optimizer between two steps: arrays and numbers by name, including ``theta (d,)``."""

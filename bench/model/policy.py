@@ -11,10 +11,10 @@ from typing import Any, ClassVar, cast
 import numpy as np
 
 from bench.errors import Unsupported
-from bench.model import registry
-from bench.model.identity import parse_identity
+from bench.host import registry
+from bench.host.identity import parse_identity
+from bench.host.parameters import Plugin, build, param, parameters, remember
 from bench.model.ops import Array, State
-from bench.model.parameters import Plugin, build, param, parameters, remember
 from bench.model.scene import MechanicalScene
 
 

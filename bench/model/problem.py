@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.errors import Unsupported, UserError, printable
+from bench.host.identity import label
+from bench.host.parameters import parameters
 from bench.model import blocks
-from bench.model.identity import label
-from bench.model.parameters import parameters
 from bench.model.program import Program
 
 if TYPE_CHECKING:

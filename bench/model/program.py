@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from bench.errors import Unsupported, UserError, unknown
+from bench.host.parameters import Plugin, traced
 from bench.model.callables import CallableScene
 from bench.model.contact import ContactLaw, ImpulseLaw
 from bench.model.dynamics import Dynamics
 from bench.model.integrator import Integrator
 from bench.model.ops import Array, Ops, State
-from bench.model.parameters import Plugin, traced
 from bench.model.scene import EngineScene, FunctionScene, MechanicalScene, Scene
 
 REVISION = 1

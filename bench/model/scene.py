@@ -11,9 +11,9 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from bench.errors import Unsupported, UserError
+from bench.host.parameters import Plugin, param, traced
 from bench.model.contact import Contact, ContactLaw
 from bench.model.ops import Array, State
-from bench.model.parameters import Plugin, param, traced
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from bench.errors import Unsupported
-from bench.model.parameters import Plugin, param
+from bench.host.parameters import Plugin, param
 
 TrainerState = Any
 """The complete state of a trainer between two updates: a tree of arrays that can be pickled."""

@@ -14,7 +14,7 @@ from bench.errors import UserError, printable, unknown
 from bench.experiment.experiment import Experiment
 from bench.experiment.study import study_of
 from bench.experiment.views import Views
-from bench.model import guard
+from bench.host import guard
 from bench.report import answer, generic, ladder, reproduce, writer
 from bench.report.views import newest_rows
 from bench.report.web.data import page_data

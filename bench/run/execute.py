@@ -20,16 +20,17 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.keys import HASHED
 from bench.experiment.parameters import completed_rows
 from bench.experiment.study import study_of
+from bench.host import guard, reads
 from bench.measure import timing
-from bench.model import Estimator, guard, reads
+from bench.model import Estimator
 from bench.run import descents, progress
 from bench.run.files import remove_stale
 from bench.run.ladder import climb
 from bench.run.launchers import Launcher, launcher_of
 from bench.run.plan import Planned, plan
-from bench.run.pool import Answer
+from bench.run.pool import TaskResult
 from bench.run.record import kind_of_machine
-from bench.run.session import Session
+from bench.run.session import RunSession
 from bench.run.store import Store, sort_rows
 from bench.run.tasks import FAILED, Task, group_by_program, result_of, row_of
 
@@ -129,7 +130,7 @@ def _refuse_without_supported_cells(experiment: Experiment, planned: Sequence[Pl
 
 def missing_references(experiment: Experiment, cells: Sequence[Cell]) -> list[Cell]:
     """Return one cell for each reference to compute; closed forms are computed when their cells are measured."""
-    references = Session(experiment).references
+    references = RunSession(experiment).references
     # reversed twice, so that the first cell of each key remains, in the planned order
     first = {cell.reference_key: cell for cell in reversed(cells) if cell.budget is not None}
     with guard.contained():  # this calls backends, to find out which can compute references
@@ -226,7 +227,7 @@ class Runner:
         for answers in self._answers([Task(cell) for cell in cells], launcher):
             self._finish([(a.item.cell, result_of(a)) for a in answers])
 
-    def _answers(self, tasks: list[Task], launcher: Launcher) -> Iterator[list[Answer]]:
+    def _answers(self, tasks: list[Task], launcher: Launcher) -> Iterator[list[TaskResult]]:
         with guard.contained():
             groups = group_by_program(tasks)
         n_done = 0
@@ -244,7 +245,7 @@ class Runner:
                 current += f" ({n_done} of {len(tasks)} {what} done)"
             self.shown.working(current)
 
-    def _changed(self, answer: Answer) -> str:
+    def _changed(self, answer: TaskResult) -> str:
         """Return what had another content when the cells were planned or an earlier one ran; empty if there is nothing."""
         if (text := answer.result.get("reads", "")) in self.unchanged:
             return ""

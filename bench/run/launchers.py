@@ -15,7 +15,7 @@ from dataclasses import replace
 
 from bench.experiment.experiment import Experiment
 from bench.experiment.study import study_of
-from bench.run.pool import BATCH_S, Answer, Pool, ResourceLimits
+from bench.run.pool import BATCH_S, Pool, ResourceLimits, TaskResult
 from bench.run.tasks import FAILED, Task, TaskHandler
 
 
@@ -32,9 +32,9 @@ class InProcessLauncher:
     def __exit__(self, *_: object) -> None:
         self._handle.close()
 
-    def run(self, groups: Iterable[Iterable[Task]]) -> Iterator[list[Answer]]:
+    def run(self, groups: Iterable[Iterable[Task]]) -> Iterator[list[TaskResult]]:
         """Yield an empty list before each task, and answers after it; the answers of quick tasks are yielded together."""
-        answers: list[Answer] = []
+        answers: list[TaskResult] = []
         since = time.perf_counter()
         for task in itertools.chain.from_iterable(groups):
             self.current = [task]
@@ -47,7 +47,7 @@ class InProcessLauncher:
             try:
                 self._handle.prepare(task)
                 started = time.perf_counter()
-                answers.append(Answer(task, self._handle(task), time.perf_counter() - started))
+                answers.append(TaskResult(task, self._handle(task), time.perf_counter() - started))
             except BaseException:
                 yield answers  # the caller stores them before the error arrives
                 raise

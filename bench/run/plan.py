@@ -14,8 +14,9 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.grid import COUNTS, cells
 from bench.experiment.parameters import completed_json
 from bench.experiment.study import study_of
-from bench.model import Backend, Plugin, guard, reads, registry
-from bench.model.parameters import remember
+from bench.host import guard, reads
+from bench.host.parameters import remember
+from bench.model import Backend, Plugin, registry
 from bench.run.record import version_of
 from bench.run.store import Store
 

@@ -28,7 +28,8 @@ from typing import IO, Any, Literal
 import psutil
 
 from bench.errors import STATUSES, StorageError, UserError, describe_exit, failure
-from bench.model import guard, registry
+from bench.host import guard
+from bench.model import registry
 from bench.run.reaper import MARK, Reaper, kill_marked_processes
 from bench.run.worker import Handler, command
 
@@ -66,7 +67,7 @@ class ResourceLimits:
 
 
 @dataclass(frozen=True)
-class Answer:
+class TaskResult:
     """The result of an item, or the reason why it has none."""
 
     item: Any
@@ -135,13 +136,13 @@ class _Worker:
         except OSError:
             self.fault = LOST
 
-    def send_next(self) -> Answer | None:
+    def send_next(self) -> TaskResult | None:
         """Send the next item of the queue; returns an answer with the failure if the item cannot be pickled."""
         item = self.queue.popleft()
         try:
             message = pickle.dumps(item)
         except Exception as error:
-            return Answer(item, dict(failure(error)), 0.0)
+            return TaskResult(item, dict(failure(error)), 0.0)
         self.item, self.is_prepared, self.since = item, False, time.monotonic()
         self.send(message)
         return None
@@ -158,9 +159,9 @@ class _Worker:
         lines = [line for line in printable if line]
         return " | ".join(lines[:3] if crash else lines[-4:])[-600:]
 
-    def receive(self) -> list[Answer]:
+    def receive(self) -> list[TaskResult]:
         """Return the answers that have arrived. A fault of the connection or of a message is stored in ``fault``."""
-        answers: list[Answer] = []
+        answers: list[TaskResult] = []
         try:
             while not self.fault and self.connection.poll():
                 answers += self._read(self.connection.recv_bytes(MAX_MESSAGE))
@@ -172,7 +173,7 @@ class _Worker:
             self.fault = "sent a malformed message"
         return answers
 
-    def _read(self, message: bytes) -> list[Answer]:
+    def _read(self, message: bytes) -> list[TaskResult]:
         """Return the answers in a message, one or none; raises :class:`StorageError`, and any error if it is malformed."""
         content = json.loads(message)
         match content["event"]:
@@ -190,7 +191,7 @@ class _Worker:
                 item, self.item, self.pace = self.item, None, seconds
                 self.is_done = content.get("is_last") is True
                 self.n_answered += 1
-                return [Answer(item, result, seconds, self.take_output())]
+                return [TaskResult(item, result, seconds, self.take_output())]
             case event:
                 raise ValueError(f"unknown event {event}")
         return []
@@ -254,7 +255,7 @@ class Pool:
             self._reaper.close()
             self._reaper = None
 
-    def run(self, groups: Sequence[Sequence[Any]]) -> Iterator[list[Answer]]:
+    def run(self, groups: Sequence[Sequence[Any]]) -> Iterator[list[TaskResult]]:
         """Yield answers as they arrive, one per item, and an empty list if none arrive within :data:`TICK`.
 
         The items of a group go to one worker, in order, unless another worker is idle.
@@ -282,7 +283,7 @@ class Pool:
         """The items being worked on."""
         return [worker.item for worker in self._workers if worker.item is not None]
 
-    def _assign(self, waiting: deque[deque[Any]]) -> list[Answer]:
+    def _assign(self, waiting: deque[deque[Any]]) -> list[TaskResult]:
         """Assign work to every idle worker, and start more workers while groups are waiting; returns failures to send."""
         for worker in [worker for worker in self._workers if not worker.queue and worker.item is None]:
             place = next((i for i, group in enumerate(waiting) if self._may_run(worker, group)), None)
@@ -299,7 +300,7 @@ class Pool:
                 worker = self._start_worker()
                 worker.queue = groups.popleft()
                 self._workers.append(worker)
-        answers: list[Answer] = []
+        answers: list[TaskResult] = []
         for worker in self._workers:
             while worker.queue and worker.is_ready and worker.item is None:
                 worker.outside = worker.outside or self._outside(worker.queue[0])
@@ -340,7 +341,7 @@ class Pool:
         worker.send(self._first_message)  # short enough to be sent before the worker reads
         return worker
 
-    def _collect(self, worker: _Worker, waiting: deque[deque[Any]]) -> list[Answer]:
+    def _collect(self, worker: _Worker, waiting: deque[deque[Any]]) -> list[TaskResult]:
         """Return a worker's new answers. A worker that has died or exceeds a limit is removed and its items reassigned."""
         answers = worker.receive()
         end = self._check(worker)
@@ -367,7 +368,7 @@ class Pool:
                 return answers
             twice = ", in two workers" if id(item) in self._crashed else ""
             status = "timeout" if kind == "timeout" else "crashed"
-            answers.append(Answer(item, {"status": status, "reason": reason + twice}, seconds, output))
+            answers.append(TaskResult(item, {"status": status, "reason": reason + twice}, seconds, output))
         if rest:
             waiting.appendleft(rest)
         return answers

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from bench.errors import printable
 from bench.experiment.experiment import Experiment
+from bench.host.parameters import remember
 from bench.measure import timing
-from bench.model.parameters import remember
 from bench.run.files import write_whole
 from bench.run.rows import read_record
 

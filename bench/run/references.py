@@ -15,9 +15,10 @@ from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
 from bench.experiment.keys import fingerprint, hash_of_text
 from bench.experiment.session import Problems
+from bench.host import reads
 from bench.measure import reference, smoothed
 from bench.measure.reference import Reference
-from bench.model import Backend, Problem, reads, registry
+from bench.model import Backend, Problem, registry
 from bench.run.files import make_directory, write_whole
 from bench.run.rows import read_parquet
 

@@ -7,7 +7,7 @@ from bench.experiment.experiment import Experiment
 from bench.run.references import References
 
 
-class Session(session.Session):
+class RunSession(session.Session):
     """The session of one run, as studies see it, with the run's own references."""
 
     references: References

@@ -17,14 +17,15 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.keys import fingerprint, names_files
 from bench.experiment.parameters import PROBLEM
 from bench.experiment.study import Study, study_of
+from bench.host import guard, isolation, reads
 from bench.measure import descent, noise
 from bench.measure.statistics import PHYSICS
-from bench.model import Backend, Plugin, guard, isolation, reads, registry
+from bench.model import Backend, Plugin, registry
 from bench.run.plan import versions
-from bench.run.pool import Answer
+from bench.run.pool import TaskResult
 from bench.run.record import kind_of_machine
 from bench.run.rows import rule
-from bench.run.session import Session
+from bench.run.session import RunSession
 
 MAX_REASON = 2000
 """Length of the longest stored reason, in characters."""
@@ -71,7 +72,7 @@ class TaskHandler:
     """Handles the tasks of one experiment, in a worker or in this process."""
 
     def __init__(self, experiment: Experiment, single_thread: bool = False) -> None:
-        self._session = Session(experiment)
+        self._session = RunSession(experiment)
         self._study = study_of(experiment)
         self._state = isolation.ProcessState(single_thread)
         RAN.update(registry.IMPORTED)
@@ -145,7 +146,7 @@ def outside_of(parts: Iterable[Plugin | None]) -> frozenset[str]:
     return frozenset(names)
 
 
-def measure_cell(cell: Cell, session: Session, study: Study) -> dict[str, Any]:
+def measure_cell(cell: Cell, session: RunSession, study: Study) -> dict[str, Any]:
     """Return the results of a cell, or the status and reason of its failure; never raises for a plugin's error."""
     try:
         result = study.measure(cell, session)
@@ -164,7 +165,7 @@ def measure_cell(cell: Cell, session: Session, study: Study) -> dict[str, Any]:
     return result | {"reason": "; ".join(filter(None, (result.get("reason", ""), *cell.remarks)))}
 
 
-def solver_columns(cell: Cell, session: Session, result: dict[str, Any]) -> dict[str, Any]:
+def solver_columns(cell: Cell, session: RunSession, result: dict[str, Any]) -> dict[str, Any]:
     """Return the residual of the backend's constraint solver, and its remarks in ``reason``, also where it has not converged.
 
     A backend whose physics differ from those that its name stands for has a method ``remarks(program)``: a text for each.
@@ -215,7 +216,7 @@ def group_by_program(tasks: list[Task]) -> list[list[Task]]:
     return sorted(groups.values(), key=lambda group: sorted(group[0].outside))
 
 
-def result_of(answer: Answer, prefix: str = "") -> dict[str, Any]:
+def result_of(answer: TaskResult, prefix: str = "") -> dict[str, Any]:
     """Return an answer's result with its time and machine; a failure's reason gets the prefix and the last output."""
     result = answer.result | {"wall_s": answer.seconds, "machine": kind_of_machine()}
     if result["status"] in FAILED:

@@ -14,7 +14,8 @@ from multiprocessing.connection import Connection
 from typing import Any, Protocol
 
 from bench.errors import StorageError, failure
-from bench.model import guard, reads, registry
+from bench.host import guard, reads
+from bench.model import registry
 
 PROGRAM = "import sys; sys.path[:] = sys.argv.pop().split(chr(0x1f)); from bench.run.worker import main; main()"
 """The program of a worker. It has the import path of its run, and does not import the run's main script."""

@@ -18,6 +18,7 @@ from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
 from bench.experiment.grid import cells
 from bench.experiment.reference_backends import backends_with_jacobians
+from bench.host.identity import label
 from bench.measure import noise
 from bench.model import (
     Jacobians,
@@ -32,8 +33,7 @@ from bench.model import (
     rollout,
     slopes_along,
 )
-from bench.model.identity import label
-from bench.run.session import Session
+from bench.run.session import RunSession
 from bench.trace import sentences
 from bench.trace.contacts import contact_columns
 
@@ -74,7 +74,7 @@ def run(experiment: Experiment, seeded: bool) -> list[Trace]:
     seed. Raises :class:`UserError` for a scene without a rollout, for several rollouts of one scene, and for a backend
     without step Jacobians.
     """
-    session = Session(experiment)
+    session = RunSession(experiment)
     return [_of_cell(session, cell, seeded) for cell in _chosen(experiment)]
 
 
@@ -93,7 +93,7 @@ def _chosen(experiment: Experiment) -> list[Cell]:
     return [cell for rollouts in unique.values() for cell in rollouts.values()]
 
 
-def _of_cell(session: Session, cell: Cell, seeded: bool) -> Trace:
+def _of_cell(session: RunSession, cell: Cell, seeded: bool) -> Trace:
     scene = cell.scene
     if not isinstance(scene, MechanicalScene):
         raise UserError(f"scene {scene.name} is a plain function: it has no steps to trace")

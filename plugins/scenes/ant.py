@@ -7,7 +7,7 @@ import numpy as np
 
 from bench.model import Array, State, param
 
-from ..legged import Legged
+from .legged import Legged
 
 DIRECTIONS = {"a": 45, "b": 135, "c": 225, "d": 315}
 """Direction of each leg in the plane [deg]."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from bench.model import Array, State, param
 
-from ..legged import Legged
+from .legged import Legged
 
 SIDES = {"front_left": (1, 1), "front_right": (1, -1), "back_left": (-1, 1), "back_right": (-1, -1)}
 """Sign of the hip's x and y by leg."""

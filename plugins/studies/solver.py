@@ -12,8 +12,8 @@ from bench.experiment.columns import Column, Columns, exact, numbers, seconds
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Mark, Views
+from bench.host.parameters import values
 from bench.model import param
-from bench.model.parameters import values
 
 from . import PARTS, StudyPackage, finite_status, first_batch, gradient_seconds, norm, relative_error
 

@@ -24,6 +24,7 @@ from bench.conformance.subjects import (
 )
 from bench.conformance.subjects import programs as programs_of
 from bench.engines.backend import EngineBackend
+from bench.host.identity import changed
 from bench.model import (
     Backend,
     ContactScene,
@@ -37,7 +38,6 @@ from bench.model import (
     compose,
     registry,
 )
-from bench.model.identity import changed
 
 STEPS = 50
 """Most steps of a rollout in the fast tests, and as in the slow ones where a scene declares to jump."""

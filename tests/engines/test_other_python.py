@@ -220,7 +220,7 @@ def test_children_that_plugins_leave_are_killed_and_engines_are_not():
 import subprocess, sys
 import psutil
 sys.path[:0] = {PATHS!r}
-from bench.model import guard
+from bench.host import guard
 from test_other_python import BouncingBall, noise, process, program, registry, toy, TOYS
 registry.add_folder(TOYS)
 problem = toy().compile(program(BouncingBall()))

@@ -110,7 +110,7 @@ def test_keys_hash_share_path_and_revision_and_no_theta(monkeypatch):
     assert len({tuple(some) for some in different}) == len(different)
     cell = loaded(*words)[1][0]
     before = [cell.key, cell.program_key, cell.reference_key]
-    placed = replace(cell, point=descent.Point((0.0,) * 30, 1.0, {}))
+    placed = replace(cell, point=descent.DescentPoint((0.0,) * 30, 1.0, {}))
     assert [placed.key, placed.program_key, placed.reference_key] == before
     monkeypatch.setattr(descent, "REVISION", 2)
     cell_module._reference_keys.clear()

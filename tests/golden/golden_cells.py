@@ -13,9 +13,9 @@ import numpy as np
 import yaml
 
 from bench.experiment import config, grid
+from bench.host.identity import label, parse_identity
 from bench.model import registry
-from bench.model.identity import label, parse_identity
-from bench.run.session import Session
+from bench.run.session import RunSession
 from bench.run.tasks import measure_cell
 
 FOLDER = Path(__file__).parent
@@ -59,7 +59,7 @@ def name_of(cell):
 
 def session_of(experiment, folder):
     """Return a session that finds no references computed earlier."""
-    return Session(replace(experiment, results_dir=Path(folder)))
+    return RunSession(replace(experiment, results_dir=Path(folder)))
 
 
 def measure_line(line):

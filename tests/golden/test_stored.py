@@ -13,8 +13,8 @@ from bench.engines.backend import EngineBackend
 from bench.experiment import config
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Budget
+from bench.host.parameters import build
 from bench.model import Decision, registry
-from bench.model.parameters import build
 
 QUICK_S = 1.0
 """Rows whose cells took longer are left out, except the quickest one of an engine in another Python."""

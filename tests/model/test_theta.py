@@ -25,9 +25,9 @@ from classes import (
 
 from bench.conformance import subjects
 from bench.errors import UserError
+from bench.host.parameters import parameters
 from bench.measure.reference import certify
 from bench.model import Decision, Rollout, compose
-from bench.model.parameters import parameters
 
 AGREES = 1e-6
 """Relative difference of gradients and differences of the cost; those below are good to about 1e-9."""

@@ -25,7 +25,7 @@ from helpers import loaded
 import bench
 from bench.measure import noise
 from bench.model import compose
-from bench.run.session import Session
+from bench.run.session import RunSession
 
 SIGMA, SAMPLES, REPEATS = 0.1, 200, 400
 
@@ -103,7 +103,7 @@ def test_a_row_of_the_plain_gradient_has_no_variance_and_no_remark(estimator, sc
         f"scenes=[{scene}]", "backends=[numpy]", f"estimators=[{estimator}]", "samples=8", "repeats=4", "timing=false",
         "reference.samples=4096", f"results_dir={tmp_path}",
     )  # fmt: skip
-    row = made.study.measure(cell, Session(made))
+    row = made.study.measure(cell, RunSession(made))
     assert (row["variance"], row["variance_high"]) == (0.0, 0.0)
     assert row["bias_low"] <= row["bias"] <= row["bias_high"]
     assert row["gradients"] + row["rollouts"] == (1 if estimator == "plain" else 2 * len(row["point"]))

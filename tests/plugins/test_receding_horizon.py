@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bench.plugins.optimizers.mppi import Mppi
+from bench.plugins.studies.optimise.solve import solve
 
 import bench
-from bench.measure.solve import solve
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = runpy.run_path(str(ROOT / "examples" / "control" / "receding_horizon.py"))

@@ -3,8 +3,8 @@
 import pytest
 
 from bench.experiment.by_name import make
+from bench.host.identity import parse_identity
 from bench.model import Decision, MechanicalScene, compose, registry
-from bench.model.identity import parse_identity
 
 BACKENDS = [
     ("mujoco", "pushing softplus", "replaces penalty, not softplus"),

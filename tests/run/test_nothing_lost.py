@@ -16,7 +16,7 @@ from trees import bench, hearing_signals, processes_in, wait_for
 
 from bench.cli import main
 from bench.errors import UserError
-from bench.model.guard import temporary_file
+from bench.host.guard import temporary_file
 from bench.run import files
 from bench.run.pool import Pool, ResourceLimits, _Worker
 from bench.run.store import Store
@@ -302,7 +302,7 @@ def test_workers_that_hold_the_interpreter_lock_end_with_their_run(tmp_path):
 COLLECTED = """
 import gc, os, signal
 from bench.cli import _stop_on_signals
-from bench.model.guard import protect_process
+from bench.host.guard import protect_process
 
 def struck(*_):
     gc.callbacks.remove(struck)

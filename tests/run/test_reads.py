@@ -11,7 +11,8 @@ from classes import Fobg
 
 from bench.experiment import keys
 from bench.experiment.config import load
-from bench.model import EngineScene, reads, registry
+from bench.host import reads
+from bench.model import EngineScene, registry
 from bench.run.execute import Runner, Stopped, execute
 from bench.run.plan import plan
 from bench.run.store import Store

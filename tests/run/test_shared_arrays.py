@@ -10,7 +10,7 @@ from bench.experiment.config import load
 from bench.experiment.grid import cells
 from bench.measure import noise
 from bench.run.execute import execute
-from bench.run.session import Session
+from bench.run.session import RunSession
 
 WAYS = {
     "numpy": "base = array if array.base is None else array.base\n    base.setflags(write=True)\n    base *= 2.0",
@@ -87,7 +87,7 @@ def test_writing_in_place_changes_no_other_cell(tmp_path, workers):
 
 def test_every_caller_has_arrays_of_its_own(tmp_path):
     experiment = load([*WORDS, "estimators=[fobg]", f"results_dir={tmp_path}"])
-    cell, session = cells(experiment)[0], Session(experiment)
+    cell, session = cells(experiment)[0], RunSession(experiment)
     reference, problem = session.references.of(cell), session.problem(cell)
     kept = [np.array(value) for value in vars(reference).values() if isinstance(value, np.ndarray)]
     for value in vars(reference).values():

@@ -16,7 +16,7 @@ from helpers import loaded
 
 from bench import cli
 from bench.model import Compilations, blocks, compose, registry
-from bench.run.session import Session
+from bench.run.session import RunSession
 from bench.run.tasks import measure_cell
 
 # ------------------------------------------------------------------------------------------------------------ blocks
@@ -160,7 +160,7 @@ def test_a_compile_time_stands_in_the_row_of_the_cell_that_compiled(monkeypatch)
         "scenes=[pushing]", "scene.pushing.horizon=7", "estimators=[fobg]", "sweep.stiffness=[100,1000]", "samples=8",
         "repeats=4", "reference.samples=512", "reference.tolerance=1", "compile_cache=null",
     )  # fmt: skip
-    session = Session(given)
+    session = RunSession(given)
     first, second = (measure_cell(cell, session, cell.study) for cell in cells)
     assert first["compile_s"] > 0
     assert math.isnan(second["compile_s"])

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from bench.plugins.studies.bias_variance.measure import Estimates
+from bench.plugins.studies.bias_variance.measure import CellEstimates
 from helpers import loaded
 
 from bench.measure import noise, statistics
@@ -23,7 +23,7 @@ def cell_of(estimator, samples=48, repeats=4):
 def made(cell):
     program = compose(cell.scene)
     problem = cell.backend.compile(program)
-    estimates = Estimates(cell, problem, program.theta0)
+    estimates = CellEstimates(cell, problem, program.theta0)
     return estimates, estimates.of(0, cell.repeats)
 
 

@@ -7,7 +7,9 @@ import numpy as np
 import pandas as pd
 import pytest
 import wrong_models
+from bench.plugins.studies.identify import adequacy
 from bench.plugins.studies.identify import views as shown
+from bench.plugins.studies.identify.information import Information, product
 from bench.plugins.studies.identify.measure import (
     information,
     missing_terms,
@@ -20,8 +22,6 @@ from scipy.integrate import solve_ivp
 import bench
 from bench.errors import Unsupported
 from bench.experiment import config
-from bench.measure import adequacy
-from bench.measure.identification import Information, product
 
 SPRING = ("scenes=[mass_spring_damper]", "integrators=[rk4]")
 FORCED = ("scenes=[mass_spring_damper[force=0.5]]", "integrators=[rk4]")

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 from bench.plugins.studies.optimise import views as studied
 from bench.plugins.studies.optimise.measure import scene_class
+from bench.plugins.studies.optimise.solve import solve
 from classes import ExplicitEuler, Impulse, Lqr, Penalty, SemiImplicitEuler, TwoBalls
 from helpers import loaded
 
@@ -15,8 +16,7 @@ from bench.cli import main
 from bench.experiment import config
 from bench.experiment.study import study_of
 from bench.measure import performance
-from bench.measure.solve import solve
-from bench.run.session import Session
+from bench.run.session import RunSession
 
 CHECKED = 1e-6
 """Relative agreement with the checked optima."""
@@ -56,7 +56,7 @@ def test_two_balls():
 def test_classes_of_problems():
     def class_of(*words):
         made, (cell,) = loaded("study=optimise", "backends=[numpy]", "estimators=[fobg]", "optimizers=[adam]", *words)
-        return scene_class(cell, Session(made).problem(cell))
+        return scene_class(cell, RunSession(made).problem(cell))
 
     assert class_of("scenes=[spring_record[horizon=4]]") == "identification"
     assert class_of("scenes=[quadratic]", "theta=[condition]") == "identification"
@@ -126,7 +126,7 @@ def test_paths_end_at_the_budget_and_near_the_optimum(finished):
 
 def measured(*words, folder):
     experiment, (cell,) = loaded(*BARE, *words, f"results_dir={folder}")
-    return study_of(experiment).measure(cell, Session(experiment))
+    return study_of(experiment).measure(cell, RunSession(experiment))
 
 
 def test_tables_charts_and_page(finished):

@@ -3,13 +3,13 @@
 import pytest
 from helpers import loaded
 
-from bench.run.session import Session
+from bench.run.session import RunSession
 
 
 def ends(*words):
     """The rows of an experiment's cells, in order."""
     made, cells = loaded(*words)
-    session = Session(made)
+    session = RunSession(made)
     return [made.study.measure(cell, session) for cell in cells]
 
 

@@ -13,7 +13,7 @@ from helpers import loaded, unmeasured
 from bench.errors import Unsupported
 from bench.model import MechanicalScene, State, registry
 from bench.run import tasks
-from bench.run.session import Session
+from bench.run.session import RunSession
 
 STIFFNESS = tuple(float(k) for k in np.logspace(1, 4, 13))
 HORIZON, DT = 40, 0.05
@@ -27,7 +27,7 @@ def cells_of(*words):
 def measured(*words):
     """The measured rows of a command line."""
     given, cells = cells_of(*words)
-    session = Session(given)
+    session = RunSession(given)
     return pd.DataFrame([cell.columns() | tasks.measure_cell(cell, session, cell.study) for cell in cells])
 
 
@@ -136,7 +136,7 @@ def test_verdicts(gradient, truth, verdict):
 def test_truth_is_refined_where_there_is_no_physical_gradient():
     """q_N = q_0 + v_0 (1 - e^(-T/10)) 10, whose Euler error is about dt T / 20 of the second component."""
     given, (cell,) = cells_of("scenes=[mass_spring]", "integrators=[semi_implicit_euler]", "backends=[jax]")
-    row = LIMITS.measure(cell.with_part("scene", Drop(horizon=10, dt=0.1)), Session(given))
+    row = LIMITS.measure(cell.with_part("scene", Drop(horizon=10, dt=0.1)), RunSession(given))
     assert row["truth"] == "refined"
     assert row["verdict"] == "ok"
     truth = math.hypot(1.0, 10 * (1 - math.exp(-0.1)))

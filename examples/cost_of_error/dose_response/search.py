@@ -11,9 +11,9 @@ from functools import lru_cache, partial
 import numpy as np
 from bench.plugins.studies.optimise.measure import advance, estimates, mean_costs, objective
 
+from bench.host.parameters import parameters
 from bench.measure import noise
 from bench.model import Answer, Estimator, Optimizer, Problem
-from bench.model.parameters import parameters
 
 from .batched import run_batched
 

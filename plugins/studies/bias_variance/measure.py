@@ -29,7 +29,7 @@ MOST_TERMS = 1 << 25
 """Most numbers in the terms of one call (256 MiB): d per sample. With more, fewer repeats or samples share a call."""
 
 
-class Estimates:
+class CellEstimates:
     """The independent estimates of a cell, computed on request, and statistics of their single terms."""
 
     def __init__(self, cell: Cell, problem: Problem, theta: np.ndarray) -> None:
@@ -146,7 +146,7 @@ def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]
     theta = program.theta0
     truth = session.references.of(cell)
     problem = session.problem(cell)
-    estimates = Estimates(cell, problem, theta)
+    estimates = CellEstimates(cell, problem, theta)
 
     timing.reset_peak_memory()
     calls = (cell.repeats if cell.backend.compiles else min(study.timed_calls, cell.repeats)) if cell.timing else 0
@@ -222,7 +222,7 @@ def summarise_diagnostics(diagnostics: list[Auxiliaries]) -> str:
     return json.dumps(table) if table else ""
 
 
-def locate_first_bad(cell: Cell, problem: Problem, estimates: Estimates, repeat: int) -> str:
+def locate_first_bad(cell: Cell, problem: Problem, estimates: CellEstimates, repeat: int) -> str:
     """Return a string with the theta, seed and sample to reproduce an estimate that is not finite.
 
     The sample is the first one of the repeat whose cost or gradient at theta is not finite. There may be none: an

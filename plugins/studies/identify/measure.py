@@ -16,8 +16,8 @@ from scipy.special import chdtri
 from bench.errors import Unsupported, unknown
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
-from bench.measure import adequacy, noise, performance
-from bench.measure.identification import Information, product
+from bench.host.parameters import named
+from bench.measure import noise, performance
 from bench.model import (
     Answer,
     Decision,
@@ -29,10 +29,10 @@ from bench.model import (
     compose,
     rollout,
 )
-from bench.model.parameters import named
 
 from .. import norm
-from . import START, Identify
+from . import START, Identify, adequacy
+from .information import Information, product
 from .record import evaluate, expressions, read
 
 STEP = 1e-5

@@ -14,13 +14,13 @@ import numpy as np
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import noise
-from bench.measure.solve import solve
 from bench.model import IID, Answer, Design, Estimator, KnownOptimum, Optimizer, Problem, Rollout, zeroth_order
 from bench.model.program import OWN
 from bench.run.files import make_directory, write_whole
 
 from .. import against_reference, ratio
 from . import Optimise, search_parts
+from .solve import solve
 
 PATH = ("iteration", "cost", "rollouts", "gradients", "s")
 """What is recorded along a path."""

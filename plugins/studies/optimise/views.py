@@ -15,8 +15,8 @@ from bench.experiment.columns import Column, interval, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import named
 from bench.experiment.views import Chart, Table, Views
+from bench.host.parameters import remember
 from bench.measure import performance
-from bench.model.parameters import remember
 from bench.report.colours import method_styles
 from bench.report.problems import problem_names, titled
 from bench.report.text import axis_value

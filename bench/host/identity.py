@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from bench.errors import UserError, printable
-from bench.model.parameters import Plugin, parameters, values
+from bench.host.parameters import Plugin, parameters, values
 
 
 def identity(name: str, given: Mapping[str, Any]) -> str:

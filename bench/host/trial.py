@@ -18,7 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from bench.model import guard
+from bench.host import guard
 
 TIMEOUT_S = 60.0
 """Time limit of the import of a file, in seconds."""
@@ -28,7 +28,7 @@ MARK = "BENCH_TRIAL"
 """Environment variable of a trial process and all processes that it starts."""
 CHILD_CODE = (
     "import json, sys; job = json.load(sys.stdin); sys.path[:] = job['path']; "
-    "from bench.model import trial; trial.run_child(job)"
+    "from bench.host import trial; trial.run_child(job)"
 )
 """The program of a trial process."""
 

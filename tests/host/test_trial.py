@@ -8,7 +8,8 @@ import pytest
 from trees import INHERITED, bench
 
 from bench.errors import UserError, failure, printable
-from bench.model import guard, registry, trial
+from bench.host import guard, trial
+from bench.model import registry
 
 GOOD = "from bench.model import SampleMean\n"
 FATAL = {
@@ -80,7 +81,7 @@ def test_a_plugin_at_work_moves_no_command_to_another_folder(tmp_path):
     """In a process of its own, since this one has threads, and must not fork."""
     code = """if True:
         import os, sys
-        from bench.model import guard
+        from bench.host import guard
         before, own, path = os.getcwd(), os.getpid(), [*sys.path]
         with guard.protect_process():
             os.chdir("/")

@@ -8,8 +8,8 @@ import pytest
 from bench.plugins.scenes.quadratic import Quadratic
 
 from bench.errors import UserError
+from bench.host.parameters import parameters
 from bench.model import FunctionScene, param
-from bench.model.parameters import parameters
 
 
 def test_unannotated_override_of_a_parameter_is_refused_with_the_fix():

@@ -27,8 +27,8 @@ from types import ModuleType
 from typing import Any
 
 from bench.errors import FOLDER, UserError, printable, unknown
-from bench.model import guard, reads, trial
-from bench.model.parameters import Plugin, build, parameters, remember, singular
+from bench.host import guard, reads, trial
+from bench.host.parameters import Plugin, build, parameters, remember, singular
 
 BUILT_IN = "bench.plugins"
 """The package of the built-in plugins."""

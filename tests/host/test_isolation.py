@@ -71,7 +71,7 @@ def test_new_processes_do_not_inherit_what_an_import_sets(tmp_path, monkeypatch)
 
 
 FRESH = """
-from bench.model.isolation import ProcessState, reduced_precision
+from bench.host.isolation import ProcessState, reduced_precision
 state = ProcessState()
 import jax
 assert jax.config.jax_enable_x64
