@@ -1,6 +1,7 @@
-"""Measures the speed of the harness, compared with a NumPy loop and native code: ``python validation/bench_self.py [FOLDER]``.
+"""Measures the speed of the harness, compared with programs written by hand: ``python validation/bench_self.py [FOLDER [PART...]]``.
 
-Writes ``FOLDER/bench_self.json`` (by default in ``results/bench_self``), from which ``docs/speed.md`` is written.
+Writes ``FOLDER/bench_self.json`` (by default in ``results/bench_self``), from which ``docs/speed.md`` is written. With names of
+parts, such as ``overhead``, only these are measured, and the other lines of the file stay.
 """
 
 import itertools
@@ -17,7 +18,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from speed import loop, native
+from speed import by_hand, loop, native
 
 from bench.experiment import config
 from bench.experiment.by_name import compile_problem
@@ -42,6 +43,13 @@ SECONDS, CALLS = 1.0, 100
 """Least total time of the timed calls of one row [s], and largest number of repeats of each of its three calls."""
 LONGEST = 20.0
 """Time per call [s] above which larger batches are skipped."""
+BY_HAND = {
+    "jax": ("grad", by_hand.jax_gradient), "torch": ("grad", by_hand.torch_gradient), "numpy": ("value", by_hand.numpy_cost),
+}  # fmt: skip
+"""Method and program by hand with which a backend is compared."""
+SMALL_SIZES = (1, 16, 100, 1_000, 10_000, 100_000)
+LEAST_BLOCK, BLOCKS = 0.02, 15
+"""Least duration of a block of equal calls [s], since the clock of the processor is coarse, and the number of pairs of blocks."""
 NATIVE_COLUMNS = 1024
 SMALL = ("scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg]", "samples=16", "repeats=4")
 
@@ -108,6 +116,38 @@ def measure_baselines():
             yield f"{name} on one thread over the C kernel, {count:g} rollouts", ratio, ""
 
 
+def measure_overhead():
+    """Yield the times of backends over those of the same rollouts by hand, in blocks that take turns in this process."""
+    for backend, (method, written) in BY_HAND.items():
+        compiled = problem(backend)
+        theta, call = compiled.program.theta0, getattr(compiled, method)
+        hand = written(compiled.program.scene, compiled.program.contact.stiffness)
+        for count in SMALL_SIZES:
+            w = batch(compiled, count)
+            ours, theirs = call(theta, w), hand(theta, w)
+            name = f"{backend} {method} over by hand, {count:g} rollouts"
+            yield f"{name}: largest relative difference", np.abs(ours - theirs).max() / np.abs(theirs).max(), ""
+            ratios = pairs(partial(call, theta, w), partial(hand, theta, w))
+            yield f"{name}: processor time", ratios[0], ""
+            yield f"{name}: wall time", ratios[1], ""
+
+
+def pairs(first, second):
+    """Return the median ratios of the processor times and of the wall times of two calls."""
+    clocks = np.array([[clocked(call) for call in (first, second)] for _ in range(BLOCKS)])
+    return np.median(clocks[:, 0] / clocks[:, 1], axis=0)
+
+
+def clocked(call):
+    """Return the processor time of this process and the wall time per call, after a call that is not timed."""
+    call()
+    count, wall, processor = 0, time.perf_counter(), time.process_time()
+    while not count or time.perf_counter() - wall < LEAST_BLOCK:
+        call()
+        count += 1
+    return (time.process_time() - processor) / count, (time.perf_counter() - wall) / count
+
+
 def compare_backends():
     """Yield the ratio of the times of gradients by ``fused`` and by ``jax`` on the same cores."""
     for scene, count in itertools.product(SCENES, (1_000, 100_000)):
@@ -170,18 +210,24 @@ def processor_seconds():
     return usage.ru_utime + usage.ru_stime
 
 
+PARTS = {
+    "backends": measure_backends, "baselines": measure_baselines, "overhead": measure_overhead, "scenes": compare_backends,
+    "compilations": count_compilations, "commands": lambda: measure_commands(100, 500),
+}  # fmt: skip
+
+
 def main(words):
     """Measure, print and write the speeds."""
-    folder = Path(*words or ["results/bench_self"])
-    load_before, lines = os.getloadavg(), []
-    for what, value, unit in itertools.chain(
-        measure_backends(), measure_baselines(), compare_backends(), count_compilations(), measure_commands(100, 500)
-    ):
+    folder, parts = Path(*words[:1] or ["results/bench_self"]), words[1:] or list(PARTS)
+    path = folder / "bench_self.json"
+    lines = {line["what"]: line for line in json.loads(path.read_text())["lines"]} if words[1:] else {}
+    load_before = os.getloadavg()
+    for what, value, unit in itertools.chain.from_iterable(PARTS[part]() for part in parts):
         print(f"{what}: {value:.3g} {unit}", flush=True)
-        lines.append({"what": what, "value": None if math.isnan(value) else value, "unit": unit})
+        lines[what] = {"what": what, "value": None if math.isnan(value) else float(value), "unit": unit}
     folder.mkdir(parents=True, exist_ok=True)
-    record = {"machine": machine(), "load_average_before": load_before, "lines": lines}
-    (folder / "bench_self.json").write_text(json.dumps(record, indent=1) + "\n")
+    record = {"machine": machine(), "load_average_before": load_before, "lines": list(lines.values())}
+    path.write_text(json.dumps(record, indent=1) + "\n")
 
 
 if __name__ == "__main__":
