@@ -15,6 +15,11 @@ from bench.model import Compilations, Executable
 KEPT = 256
 """Executables kept per process. Each has 20 to 40 memory mappings, and Linux ends a process that needs more than 65,530."""
 
+XLA_THREADS = "xla_cpu_multi_thread_eigen"
+CPU_OPTIONS: dict[str, str | bool] = {XLA_THREADS: False, "xla_cpu_copy_insertion_use_region_analysis": True}
+"""XLA's options on the CPU: blocks run in parallel, each on one thread, and loops copy no carries needlessly. The second may be
+missing in a version of XLA, and changes no result."""
+
 _known: dict[tuple[Any, ...], Executable] = {}
 _busy = threading.Lock()
 
@@ -52,17 +57,19 @@ def _compile(name: str, function: Callable[..., Any], arguments: tuple[Any, ...]
 
     _use(folder)
     _listen()
-    # blocks run in parallel, each on one thread
-    options: dict[str, str | bool] | None = None
-    if jax.default_backend() == "cpu":
-        options = {"xla_cpu_multi_thread_eigen": False}
+    options = CPU_OPTIONS if jax.default_backend() == "cpu" else None
     started = time.perf_counter()
     traced = jax.jit(function).trace(*arguments)
     after_trace = time.perf_counter()
     lowered = traced.lower()
     after_lowering = time.perf_counter()
     before = _loaded
-    call = lowered.compile(options)
+    try:
+        call = lowered.compile(options)
+    except jax.errors.JaxRuntimeError as error:
+        if "No such compile option" not in str(error):
+            raise
+        call = lowered.compile({XLA_THREADS: False})
     seconds = (after_trace - started, after_lowering - after_trace, time.perf_counter() - after_lowering)
     return Executable(name, call, seconds, loaded=_loaded > before)
 
