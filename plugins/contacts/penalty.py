@@ -32,8 +32,8 @@ class Penalty(ForceLaw):
     def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
         damper = -self.damping * gap_rate
         if self.damping_mode == "approach":
-            damper = xp.where(damper > 0, damper, 0.0 * damper)
+            damper = xp.where(damper > 0, damper, 0.0)
         force = damper - self.stiffness * gap
         if self.damping_mode == "clipped":
-            force = xp.where(force > 0, force, 0.0 * force)
-        return xp.where(gap < 0, force, 0.0 * force)
+            force = xp.where(force > 0, force, 0.0)
+        return xp.where(gap < 0, force, 0.0)
