@@ -443,7 +443,9 @@ def summarise(
     missed = THREE / (repeats * samples) if identical and not is_fixed else 0.0
     bias, variance = _spread(deviations, mean, reference, samples, missed)
     error = float(rmse(bias[0], variance[0]))
-    relative = math.nan if norm <= ROUNDING or reference.vanishes() else norm
+    # a sampled reference states its own error, rounding included
+    is_rounding = norm <= ROUNDING and not len(reference.sampling.rows)
+    relative = math.nan if is_rounding or reference.vanishes() else norm
     cosine, signs = _directions(estimates, reference.mean)
     notes = [] if is_fixed else _interval_remarks(deviations, mean - reference.mean, missed)
     notes += _reference_remarks(reference, relative)
