@@ -427,25 +427,23 @@ def summarise(
     if samples < 1:
         raise ValueError(f"an estimate is made of one sample or more; given {samples}")
     repeats = len(estimates)
-    finite = int(np.isfinite(estimates).all(axis=1).sum())
+    finite = np.isfinite(estimates).all(axis=1).sum()
     if finite < repeats:
         return _not_finite(truth, finite / repeats, f"{repeats - finite} of {repeats} estimates are not finite")
 
     # in units of the largest entry, so that squares of very large or small gradients do not overflow or underflow
-    unit = max(float(np.abs(part).max(initial=0.0)) for part in (estimates, truth.mean, truth.sampling.rows))
-    unit = unit or 1.0
+    unit = max(float(np.abs(part).max(initial=0.0)) for part in (estimates, truth.mean, truth.sampling.rows)) or 1.0
     estimates, reference = estimates / unit, truth.over(unit)
-    identical = bool((np.abs(estimates - estimates[0]) <= ROUNDING * np.abs(estimates[0])).all())
+    identical = (np.abs(estimates - estimates[0]) <= ROUNDING * np.abs(estimates[0])).all()
     mean = estimates[0] if identical else estimates.mean(axis=0)
     deviations = np.zeros_like(estimates) if identical else estimates - mean
     norm, grad_norm = reference.norm, float(np.linalg.norm(mean))
     is_fixed = identical and repeats > 1 and not is_random
     missed = THREE / (repeats * samples) if identical and not is_fixed else 0.0
     bias, variance = _spread(deviations, mean, reference, samples, missed)
-    error = float(rmse(bias[0], variance[0]))
+    error = rmse(bias[0], variance[0])
     # a sampled reference states its own error, rounding included
-    is_rounding = norm <= ROUNDING and not len(reference.sampling.rows)
-    relative = math.nan if is_rounding or reference.vanishes() else norm
+    relative = math.nan if norm <= ROUNDING * math.isinf(reference.sampling.degrees) or reference.vanishes() else norm
     cosine, signs = _directions(estimates, reference.mean)
     notes = [] if is_fixed else _interval_remarks(deviations, mean - reference.mean, missed)
     notes += _reference_remarks(reference, relative)

@@ -99,19 +99,13 @@ def test_relative_columns_mean_nothing_where_the_reference_vanishes():
     assert math.isnan(vanishing.bias_rel)
     assert math.isnan(vanishing.rmse_rel)
     assert "not distinguishable from 0" in vanishing.note
-    vague = summarise(estimates, Truth.from_batches(np.array([5.0, 0.0]) + 8 * rng.standard_normal((64, 2))), 4)
+    truth = Truth.from_batches(np.array([5.0, 0.0]) + 8 * rng.standard_normal((64, 2)))
+    vague = summarise(estimates, truth, 4)
     assert vague.rmse_rel > 0.0
+    assert summarise(1e20 * estimates, truth, 4).rmse_rel > 1e18
     assert "% of its norm" in vague.note
     assert summarise(estimates, Truth.exact(np.array([5.0, 0.0])), 4).note == ""
     assert math.isnan(summarise(estimates, Truth.exact(np.array([1e-15, 0.0]), 1e-14), 4).rmse_rel)
-
-
-def test_estimates_far_larger_than_a_sampled_reference_fail_instead_of_being_unknown():
-    rng = np.random.default_rng(4)
-    truth = Truth.from_batches(np.array([5.0, 0.0]) + rng.standard_normal((64, 2)))
-    exploded = summarise(1e20 * rng.standard_normal((16, 2)), truth, 4)
-    assert exploded.rmse_rel > 1e18
-    assert "not distinguishable from 0" not in exploded.note
 
 
 def test_error_that_sampling_does_not_show_widens_the_interval():
