@@ -184,6 +184,15 @@ def test_costs_that_do_not_grow_with_samples_are_compared_where_the_rollouts_suf
     assert compared[["axis", "at", "first"]].values.tolist() == expected
 
 
+def test_a_method_of_one_rollout_does_not_decide_the_rollouts_of_a_comparison():
+    """One call without noise may use no more, so others are compared with it at the rollouts that they take."""
+    cells = [
+        cell(error, 0.95 * error, 1.05 * error, stiffness=1e2, estimator=name, rollouts=n, gradients=0)
+        for name, n, error in (("fobg", 100, 0.1), ("randomized_smoothing", 200, 0.2), ("plain", 1, 0.3))
+    ]
+    assert made(*cells)[1][["first", "rollouts"]].values.tolist() == [["fobg", 100]]
+
+
 def test_a_far_larger_error_does_not_share_the_first_place_of_an_error_that_is_not_sure():
     """fobg 0.90 [0.87, 0.92] is tied with smoothing 0.17 [0.10, 1.7], whose interval is wide: fobg is no leader there."""
     exact = {"reference_norm": 1.0, "variance": 0.0, "variance_low": 0.0, "variance_high": 0.0}

@@ -130,7 +130,8 @@ def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:
     A method has the error of its row with as many rollouts. Without one it has that of its nearest row by RMSE^2 = bias^2 +
     v / N. Where that law does not hold, it has the error of a row with fewer rollouts, which are allowed too: with more of
     them it might be lower, so its interval begins lower. If there is none, ``not_comparable`` is true. The rollouts are the
-    fewest at which most methods are known; along samples a setting is a number of rollouts, and they are the most.
+    fewest at which most methods are known, and not fewer than the samples of any method take; along samples a setting is a
+    number of rollouts, and they are the most.
     """
     parts = [methods.assign(not_comparable=False)[:0]]
     for _, level in methods.groupby("setting", sort=False):
@@ -138,12 +139,13 @@ def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:
         is_swept = along == "samples"
         of = methods[(methods["axis"] == along) & (methods["problem"] == problem)] if is_swept else level
         spent = of["rollouts"].where(of["rollouts"] > 0)
+        least = level.loc[~level["has_fixed_work"], "rollouts"].min()
         apart = {
             cost: np.abs(np.log(spent / cost))
             .where(of["has_law"] | (spent <= SAME_COST * cost), math.inf)
             .fillna(math.inf)
             for cost in sorted(level["rollouts"].unique())
-            if cost > 0
+            if cost > 0 and not cost < least
         }
         same = {
             cost: (distance <= math.log(SAME_COST)) | (~of["has_law"] & (spent <= cost))
