@@ -106,7 +106,7 @@ def unknown(what: str, given: object, allowed: Iterable[str], see: str = "") -> 
     ``see`` is the command that lists all: with it, names longer than a line are cut.
     """
     names = sorted(allowed)
-    text, listed = str(given), ", ".join(names) or "none"
+    text, listed = printable(given)[:100], ", ".join(names) or "none"
     lower = {name.lower(): name for name in names}
     begun = [name for name in lower if text and name.startswith(text.lower())]
     near = begun[:1] or get_close_matches(text.lower(), list(lower), n=1)

@@ -33,7 +33,7 @@ from bench.model import Decision, MechanicalScene, Plugin, guard, registry
 from bench.model.identity import parse_identity
 from bench.model.parameters import Parameter, build, check, coerce, parameters, remember, singular
 
-SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 RESERVED = ("claims", "references", "standard", "trace")
 """Names of folders under ``results_dir`` that are not experiments."""
 SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
@@ -122,13 +122,15 @@ def _composed(overrides: Sequence[Override], config_dirs: Sequence[Path]) -> Exp
         raise UserError(f"one command runs one experiment with its sweep: {commands}")
     if named and named[0] not in (known := experiments(config_dirs)):
         raise unknown("experiment", named[0], known, "--help")
-    settings = deepcopy(_composed_files(next(iter(named), ""), tuple(config_dirs), _stamps(config_dirs)))
+    of_files = _composed_files(next(iter(named), ""), tuple(config_dirs), _stamps(config_dirs))
+    settings = deepcopy(of_files)
     for keys, value in overrides:
         if keys not in (["experiment"], ["answer"]):
             merge(settings, keys, value)
-    if any(keys[0] not in NEUTRAL for keys, _ in overrides):
+    if any(value != of_files.get(key) for key, value in settings.items() if key not in NEUTRAL):
         settings["answer"] = ""
-    return _joined(from_settings(settings), _as_list(settings["also"]), overrides, config_dirs)
+    also = [coerce(str, name, "also") for name in _as_list(settings["also"])]
+    return _joined(from_settings(settings), also, overrides, config_dirs)
 
 
 def _stamps(config_dirs: Sequence[Path]) -> tuple[tuple[Path, int, int], ...]:
@@ -168,7 +170,7 @@ NEUTRAL = (
     "experiment", "name", "results_dir", "answer", "compares", "formats", "compile_cache", "plugins", "workers", "timeout",
     "memory", "on_error", "ladder", "versions", "retry", "shard",
 )  # fmt: skip
-"""Settings that decide no result: with others on the command line, the answer of an experiment's file does not hold."""
+"""Settings that decide no result: where others differ from those of its file, the answer of an experiment does not hold."""
 
 
 def _joined(
@@ -264,6 +266,8 @@ def _refuse_unread(experiment: Experiment, overrides: Sequence[Override]) -> Non
         marked = {part for axis in axes for part in (axis, parameter_name(axis))}
         if head == "marks" and (unread := experiment.marks.keys() - marked):
             raise unknown("mark", min(unread), marked)
+        if head == "compares" and (unread := experiment.compares.keys() - {"backends", "estimators", *marked}):
+            raise unknown("part of compares", min(unread), {"backends", "estimators", *marked})
 
 
 def _in_use(plugins: Sequence[type[Plugin]]) -> list[type[Plugin]]:
@@ -332,7 +336,9 @@ def _compares(config: Mapping[str, Any]) -> dict[str, list[Any]]:
 def _name(config: Mapping[str, Any]) -> str:
     name = "" if config["name"] is None else str(config["name"])
     if not SAFE_NAME.fullmatch(name) or ".." in name:
-        raise UserError(f"name={name!r} must consist of letters, digits, '.', '_' and '-', since it names a folder")
+        raise UserError(
+            f"name={name[:200]!r} must be at most 100 letters, digits, '.', '_' and '-', since it names a folder"
+        )
     if name in RESERVED:
         raise UserError(f"name={name} is reserved for a folder of results_dir that is not an experiment")
     return name
@@ -359,6 +365,8 @@ def _count(config: Mapping[str, Any], key: str) -> Any:
 
 
 def _study(text: Any) -> Study:
+    if not isinstance(text, str) or text.startswith("["):
+        raise UserError(f"study={printable(text)[:100]} must be one name: write study=NAME or study=NAME[parameter=value]")
     name, values = parse_identity(text)
     study = build(registry.usable("studies", name), values)
     if not isinstance(study, Study):
@@ -397,7 +405,10 @@ def _compile_cache(value: Any) -> Path | None:
     if value is None:
         return None
     if str(value) != "default":
-        return local_path("compile_cache", value).absolute()
+        path = local_path("compile_cache", value).absolute()
+        if path.exists() and not path.is_dir():
+            raise UserError(f"compile_cache={value} is not a folder")
+        return path
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(base) / "diffsim-bench" / "jax"
 

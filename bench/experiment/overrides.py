@@ -108,10 +108,14 @@ def merge(settings: dict[str, Any], keys: Sequence[str], value: Any) -> None:
 
 def check_file(path: Path) -> dict[str, Any]:
     """Return the content of an experiment file; raises :class:`UserError` with the file and the line if it cannot be read."""
+    import yaml
     from omegaconf import OmegaConf
 
     try:
         text = path.read_bytes().decode()
+        for event in yaml.parse(text):
+            if isinstance(event, yaml.AliasEvent):  # a few lines of aliases may stand for more values than memory holds
+                raise ValueError(f"line {event.start_mark.line + 1}: *{event.anchor} is an alias: write the value itself")
         content = OmegaConf.to_container(OmegaConf.load(path), resolve=False) if text.strip() else {}
     except Exception as error:  # of the file, of YAML, and OmegaConf's own, such as a key that is a list
         raise UserError(f"'{path}' cannot be read: {printable(error)[:400]}") from None

@@ -50,6 +50,8 @@ def parse_identity(text: str) -> tuple[str, dict[str, Any]]:
             key, equals, value = item.partition("=")
             if not equals:
                 raise UserError(f"'{item}' in '{text}' is not parameter=value")
+            if key.strip() in raw:
+                raise UserError(f"'{key.strip()}' has two values in '{printable(text)[:200]}'")
             try:
                 raw[key.strip()] = value if value.startswith("{") else yaml.safe_load(value)
             except (yaml.YAMLError, ValueError, RecursionError):  # ValueError: an invalid date

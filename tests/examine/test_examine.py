@@ -372,7 +372,9 @@ def mysim(tmp_path):
 )
 def test_command_says_what_is_wrong_with_its_words(mysim, capsys, words, said):
     assert cli.main(["examine", *(word.format(mysim) for word in words)]) == 2
-    assert said in capsys.readouterr().err
+    answer = capsys.readouterr()
+    assert said in answer.err
+    assert answer.out == ""
 
 
 @pytest.mark.parametrize("file", ["save", "baseline"])

@@ -33,7 +33,9 @@ REFUSED = {
     "sweep.stiffness=[1,2]": "unknown sweep axis 'stiffness' (allowed: ",
     "marks={nosuch:{a:1}}": "unknown mark 'nosuch' (allowed: ",
     "compare . . agian=a": "did you mean 'again'", "compare --output=/tmp/x .": "unknown option of compare '--output=/tmp/x'",
-    "history . . output=x": "did you mean 'out'",
+    "history . . output=x": "did you mean 'out'", "compares={nosuch:[1]}": "unknown part of compares 'nosuch' (allowed: ",
+    "study=[bias_variance]": "study=[bias_variance] must be one name", "x" * 5000: "unknown command", "also=3": "also=3 must be a string",
+    "scenes=[heaviside[sigma=1,sigma=2]]": "'sigma' has two values", "name=" + "x" * 300: "must be at most 100 letters", "compile_cache=/dev/null": "is not a folder",
     # values
     "scenes=[]": "scenes is empty", "scenes=[pushing] sweep.stiffness=[abc]": "must be a number",
     "scenes=[pushing] sweep.stiffness=[-1]": "penalty.stiffness=-1 must be greater than 0", "samples=0": "samples=0 must be at least 1",
@@ -120,7 +122,7 @@ FILES = {
     b"1: 4\n": "line 2: 1 is not a setting",
     b"~: 4\n": "Incompatible key type",
     b"smaples: 4\n": "did you mean 'samples'?",
-    b"samples: ${seed}\n": "must be a whole number",
+    b"samples: ${seed}\n": "must be a whole number", b"sweep: &a {b: *a}\n": "line 2: *a is an alias",
     b"samples: 4\n": "must start with the line # @package _global_",
 }
 

@@ -69,6 +69,7 @@ def test_an_answer_holds_for_the_settings_of_its_file_only(tmp_path):
         "workers=1",
     ]
     assert config.load(words).answer == config.load(words[:1]).answer != ""
+    assert config.load([*words, f"samples={config.load(words).samples}"]).answer
     assert not config.load([*words, "sweep.sigma=[0.2]"]).answer
     assert not config.load([*words, "seed=1"]).answer
 
