@@ -366,7 +366,9 @@ def _count(config: Mapping[str, Any], key: str) -> Any:
 
 def _study(text: Any) -> Study:
     if not isinstance(text, str) or text.startswith("["):
-        raise UserError(f"study={printable(text)[:100]} must be one name: write study=NAME or study=NAME[parameter=value]")
+        raise UserError(
+            f"study={printable(text)[:100]} must be one name: write study=NAME or study=NAME[parameter=value]"
+        )
     name, values = parse_identity(text)
     study = build(registry.usable("studies", name), values)
     if not isinstance(study, Study):

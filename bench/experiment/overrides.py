@@ -115,7 +115,9 @@ def check_file(path: Path) -> dict[str, Any]:
         text = path.read_bytes().decode()
         for event in yaml.parse(text):
             if isinstance(event, yaml.AliasEvent):  # a few lines of aliases may stand for more values than memory holds
-                raise ValueError(f"line {event.start_mark.line + 1}: *{event.anchor} is an alias: write the value itself")
+                raise ValueError(
+                    f"line {event.start_mark.line + 1}: *{event.anchor} is an alias: write the value itself"
+                )
         content = OmegaConf.to_container(OmegaConf.load(path), resolve=False) if text.strip() else {}
     except Exception as error:  # of the file, of YAML, and OmegaConf's own, such as a key that is a list
         raise UserError(f"'{path}' cannot be read: {printable(error)[:400]}") from None

@@ -122,7 +122,8 @@ FILES = {
     b"1: 4\n": "line 2: 1 is not a setting",
     b"~: 4\n": "Incompatible key type",
     b"smaples: 4\n": "did you mean 'samples'?",
-    b"samples: ${seed}\n": "must be a whole number", b"sweep: &a {b: *a}\n": "line 2: *a is an alias",
+    b"samples: ${seed}\n": "must be a whole number",
+    b"sweep: &a {b: *a}\n": "line 2: *a is an alias",
     b"samples: 4\n": "must start with the line # @package _global_",
 }
 
