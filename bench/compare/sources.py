@@ -102,7 +102,7 @@ def _read(folder: Path) -> tuple[str, Results] | None:
     store = Store(folder, Columns.of())
     rows = store.load()
     if store.left_out:
-        raise UserError(f"'{min(store.left_out)}' has damaged rows: run the experiment again to compare it")
+        raise UserError(f"'{min(store.left_out)}' is damaged: run the experiment again to compare it")
     if rows.empty:
         return None
     if not rows[["study", "parameters"]].map(bool).all(axis=None):
@@ -111,9 +111,7 @@ def _read(folder: Path) -> tuple[str, Results] | None:
     if len(studies) != 1:
         raise UserError(f"the rows in '{folder}' are of {len(studies)} studies ({', '.join(studies)})")
     content = hashed(*(hashlib.sha256(path.read_bytes()).hexdigest() for path in store.files()))
-    rows, faulty = valid_rows(rows, columns_of(studies[0]), [folder] * len(rows))
-    if faulty:
-        raise UserError(f"'{folder}' has impossible values: run the experiment again to compare it")
+    rows = valid_rows(rows, columns_of(studies[0]), folder)
     label = str(rows["experiment"].iloc[0]) or folder.name
     return label, Results(rows, studies[0], content, _read_machine(folder))
 

@@ -6,6 +6,7 @@ import inspect
 import os
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -118,7 +119,7 @@ def _value(key: str, given: str, module: Any) -> Any:
 
 
 def _numbers(key: str, given: str) -> list[float]:
-    try:
-        return [float(part) for part in given.strip("[]() ").split(",") if part.strip()]
-    except ValueError:
-        raise UserError(f"{key}={given} is not a list of numbers: write {key}=1,0.5") from None
+    with suppress(ValueError):
+        if numbers := [float(part) for part in given.strip("[]() ").split(",") if part.strip()]:
+            return numbers
+    raise UserError(f"{key}={given} is not a list of numbers: write {key}=1,0.5")

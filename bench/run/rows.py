@@ -1,8 +1,8 @@
-"""Reads stored rows, and leaves out rows that no run has written: stored files may be damaged or foreign.
+"""Reads stored rows. Stored files may be damaged or foreign.
 
-A file that is not a table, or claims more rows than a sweep can have, is an error that names the file. Of other files,
-rows with values of a wrong type or out of range are left out, and one line on stderr names the file, the first such row
-and the number of rows left out.
+The name of a small file is the hash of its content: a file with another content is left out, and a line on stderr names it. A
+table that cannot be read, claims more rows than a sweep can have, or has a value of a wrong type or out of range is an error
+that names the file and the row.
 """
 
 from __future__ import annotations
@@ -11,9 +11,8 @@ import hashlib
 import io
 import json
 import math
-import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,11 +51,10 @@ TABLES = ("machine", "versions", "config", "counts")
 LARGEST = 2.0**53
 """Larger counts are not exact as float64, so no run has written them."""
 
-CHECKSUM = re.compile("[0-9a-f]{64}")
-"""Names of small files: the SHA-256 of their content."""
+AWAY = "move it away to start afresh"
 
-_reported: set[str] = set()
-"""Sentences that were printed, since a command reads its files more than once."""
+_reported: set[Path] = set()
+"""The damaged files that were named, since a command reads its files more than once."""
 
 
 def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFrame:
@@ -98,76 +96,44 @@ def _shared(values: pd.Series) -> pd.Series:
     return pd.Series(pd.array(distinct[values.cat.codes.to_numpy()], dtype=dtype), index=values.index)
 
 
-def read_table(path: Path, columns: Columns) -> tuple[pd.DataFrame, set[Path]]:
-    """Return the valid rows of ``rows.parquet`` with typed columns, and the file if it has other rows too."""
+def read_table(path: Path, columns: Columns) -> pd.DataFrame:
+    """Return the rows of ``rows.parquet`` with typed columns; raises :class:`StorageError` for a table that no run writes."""
     try:
         table = read_parquet(path)
     except FileNotFoundError:
         raise
     except Exception as error:
-        raise _unreadable(path, "Parquet", error) from None
-    return valid_rows(table, columns, [path] * len(table))
+        raise StorageError(f"'{path}' cannot be read as Parquet ({printable(error)[:300]}); {AWAY}") from None
+    return valid_rows(table, columns, path)
 
 
 def read_small(paths: Sequence[Path], columns: Columns) -> tuple[pd.DataFrame, set[Path]]:
-    """Return the valid rows of small files as one table with typed columns, and the files that have other rows too."""
+    """Return the rows of small files as one table with typed columns, and the files that are damaged: their rows are left out."""
     import pandas as pd
 
-    rows: list[dict[str, Any]] = []
-    files: list[Path] = []
-    damaged: set[Path] = set()
-    for path in paths:
-        try:
-            written = path.read_bytes()
-            if CHECKSUM.fullmatch(path.stem) and hashlib.sha256(written).hexdigest() != path.stem:
-                damaged.add(path)
-                _report(f"bench: '{path}' is damaged: its rows are left out")
-                continue
-            content = json.loads(written)
-            if not all(row["key"] and isinstance(row["key"], str) for row in content):
-                raise ValueError("a row has a key")
-        except FileNotFoundError:
-            raise
-        except Exception as error:
-            raise _unreadable(path, "JSON rows", error) from None
-        rows += content
-        files += [path] * len(content)
-    valid, spoilt = valid_rows(pd.DataFrame(rows, dtype=object), columns, files)
-    return valid, spoilt | damaged
+    contents = {path: path.read_bytes() for path in paths}
+    whole = {path for path, content in contents.items() if hashlib.sha256(content).hexdigest() == path.stem}
+    for path in contents.keys() - whole - _reported:
+        _reported.add(path)
+        print(f"bench: '{path}' is damaged: its rows are left out", file=sys.stderr)
+    rows = [row for path in paths if path in whole for row in json.loads(contents[path])]
+    return columns.typed(pd.DataFrame(rows, dtype=object).infer_objects()), contents.keys() - whole
 
 
-def _report(sentence: str) -> None:
-    """Print a sentence on stderr, once."""
-    if sentence not in _reported:
-        _reported.add(sentence)
-        print(sentence, file=sys.stderr)
+def valid_rows(table: pd.DataFrame, columns: Columns, path: Path) -> pd.DataFrame:
+    """Return the rows of a file with typed columns.
 
-
-def _unreadable(path: Path, kind: str, error: Exception) -> StorageError:
-    return StorageError(f"'{path}' cannot be read as {kind} ({printable(error)[:300]}); move it away to start afresh")
-
-
-def valid_rows(table: pd.DataFrame, columns: Columns, files: Sequence[Path]) -> tuple[pd.DataFrame, set[Path]]:
-    """Return the rows whose values are of the right types and in range, and the files of the others.
-
-    ``files`` has the file of each row. A line on stderr names each file with the number of rows that are left out.
+    Raises :class:`StorageError` with the first row whose values are of a wrong type or out of range.
     """
     if len(table) and not ("key" in table and table["key"].map(lambda key: isinstance(key, str) and bool(key)).all()):
-        raise StorageError(f"'{files[0]}' has no keys, so its rows belong to no cell; move it away to start afresh")
-    reasons = _faults(table, columns)
-    spoilt = {files[place] for place in reasons}
-    for path in spoilt:
-        own = [place for place, file in enumerate(files) if file == path]
-        faulty = [number for number, place in enumerate(own) if place in reasons]
-        first = f"'{path}', row {faulty[0] + 1}: {reasons[own[faulty[0]]]}"
-        _report(printable(f"bench: {first}; {len(faulty)} of {len(own)} rows are left out"))
-    valid = table[~np.isin(np.arange(len(table)), list(reasons))] if reasons else table
-    return columns.typed(valid.infer_objects()), spoilt
+        raise StorageError(f"'{path}' has no keys, so its rows belong to no cell; {AWAY}")
+    for place, fault in _faults(table, columns):
+        raise StorageError(printable(f"'{path}', row {place + 1}: {fault}; {AWAY}"))
+    return columns.typed(table.infer_objects())
 
 
-def _faults(table: pd.DataFrame, columns: Columns) -> dict[int, str]:
-    """Return why rows are left out, by place: values of a wrong type or out of range, or a missing value."""
-    reasons: dict[int, str] = {}
+def _faults(table: pd.DataFrame, columns: Columns) -> Iterator[tuple[int, str]]:
+    """Yield the places of values of a wrong type or out of range, or that are missing, and what is wrong with them."""
     for name in table:
         values, (holds, fault) = table[name], rule(name, columns)
         column = columns.by_name.get(name)
@@ -183,16 +149,14 @@ def _faults(table: pd.DataFrame, columns: Columns) -> dict[int, str]:
         else:
             is_valid = np.fromiter(map(holds, values), dtype=bool)
         for place in np.flatnonzero(~np.broadcast_to(is_valid, len(table))):
-            value = printable(repr(values.iloc[place]))[:60]
-            reasons.setdefault(int(place), f"{printable(name)[:60]}={value} {fault}")
+            yield int(place), f"{printable(name)[:60]}={printable(repr(values.iloc[place]))[:60]} {fault}"
     if "parameters" in table:
         is_described = ~table["parameters"].fillna("").isin(["", "{}"])
         # columns with a value in every row with parameters
         for name in ("status", "samples", "repeats", "seed"):
             is_missing = table[name].isna() | (table[name].astype(str) == "") if name in table else True
             for place in np.flatnonzero(is_described & is_missing):
-                reasons.setdefault(int(place), f"{name} is missing")
-    return reasons
+                yield int(place), f"{name} is missing"
 
 
 def rule(name: str, columns: Columns) -> tuple[Callable[[Any], bool], str]:

@@ -51,7 +51,7 @@ class Store:
         self._study = study
         self._sequence: int | None = None
         self.left_out: set[Path] = set()
-        """The files of which :meth:`load` has left out rows."""
+        """The damaged files whose rows :meth:`load` has left out."""
         self._table = directory / "rows.parquet"
         self._pending = directory / "pending"
 
@@ -82,18 +82,18 @@ class Store:
     def compact(self, order: Sequence[str] = ()) -> None:
         """Merge the small files into ``rows.parquet``; rows of the keys in ``order`` come last, in that order.
 
-        A file of which some rows are left out is kept under another name.
+        A damaged file is kept under another name.
         """
         with self._locked():
-            rows, small, spoilt = self._read_all()
+            rows, small, damaged = self._read_all()
             if not small:
                 return
             content = io.BytesIO()
             sort_rows(rows, order).to_parquet(content, index=False, compression="zstd")
-            for path in spoilt:
+            for path in damaged:
                 kept = self.directory / f"left_out-{uuid.uuid4().hex[:8]}{path.suffix}"
                 write_whole(kept, path.read_bytes())
-                print(f"bench: '{path}' is kept as '{kept}', since some of its rows are left out", file=sys.stderr)
+                print(f"bench: '{path}' is kept as '{kept}'", file=sys.stderr)
             write_whole(self._table, content.getvalue())
             for path in small:
                 path.unlink(missing_ok=True)
@@ -116,7 +116,7 @@ class Store:
             yield
 
     def _read_all(self) -> tuple[pd.DataFrame, list[Path], set[Path]]:
-        """Return the newest row of each key, the small files, and the files of which some rows are left out.
+        """Return the newest row of each key, the small files, and those that are damaged.
 
         A merge replaces the table before it deletes a small file. So the table is read last, and all is read again if a small
         file has gone meanwhile.
@@ -124,12 +124,12 @@ class Store:
         for _ in _attempts():
             with suppress(FileNotFoundError):
                 small = self._small_files()
-                parts = [read_small([path for path in small if path.suffix != ".parquet"], self._columns)]
-                parts += [read_table(path, self._columns) for path in small if path.suffix == ".parquet"]
+                rows, damaged = read_small([path for path in small if path.suffix != ".parquet"], self._columns)
+                tables = [path for path in small if path.suffix == ".parquet"]
+                parts = [rows, *(read_table(path, self._columns) for path in tables)]
                 if self._table.is_file():
                     parts.insert(0, read_table(self._table, self._columns))
-                frames = [rows for rows, _ in parts if len(rows)]
-                return self._newest(frames), small, set().union(*(spoilt for _, spoilt in parts))
+                return self._newest([rows for rows in parts if len(rows)]), small, damaged
         raise StorageError(f"'{self.directory}' changes faster than it can be read: too many runs write to it")
 
     def files(self) -> list[Path]:

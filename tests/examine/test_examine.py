@@ -366,6 +366,7 @@ def mysim(tmp_path):
         (["{}:leaves"], "it ended the process by sys.exit"),
         (["{}:nothing"], "the cost returned None"),
         (["{}:cost", "sigma=0"], "numbers above 0"),
+        (["{}:cost", "sigma="], "sigma= is not a list of numbers"),
         (["{}:cost", "theta=1"], "index 1 is out of bounds"),
         (["{0}:cost", "calls=20", "save={0}/folder"], "cannot be"),
     ],

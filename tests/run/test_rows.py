@@ -1,4 +1,4 @@
-"""Stored files may be damaged or foreign: rows that no run has written are left out and named, the rest is shown."""
+"""Stored files may be damaged or foreign: a table that no run has written is refused, with its first impossible value."""
 
 import json
 import math
@@ -11,7 +11,6 @@ import pytest
 from bench.plugins.studies.bias_variance.columns import COLUMNS
 from helpers import row, table
 
-from bench import load
 from bench.cli import main
 from bench.errors import StorageError
 from bench.model import registry
@@ -42,67 +41,32 @@ SPOILT = {
 
 
 @pytest.mark.parametrize("name", SPOILT)
-def test_a_spoilt_row_is_left_out_and_named(tmp_path, capsys, name):
+def test_a_table_with_an_impossible_value_is_refused_by_row_and_left_alone(tmp_path, name):
     column, value, said = SPOILT[name]
     good = table([row(seed=i) for i in range(3)])
     values = good[column].tolist()
     values[1] = value
     spoilt = good.assign(**{column: pd.Series(values, dtype=object if not isinstance(value, float) else float)})
-    n_left = 0 if name in ("bytes", "number", "word", "strings", "nested") else 2
-    if not n_left:  # a column of Parquet has one type
+    is_whole = name in ("bytes", "number", "word", "strings", "nested")
+    if is_whole:  # a column of Parquet has one type
         spoilt = spoilt.assign(**{column: pd.Series([value] * 3, dtype=object)})
-    spoilt.to_parquet(tmp_path / "rows.parquet")
-    assert len(Store(tmp_path, COLUMNS).load()) == n_left
-    line = capsys.readouterr().err
-    assert line.startswith(f"bench: '{tmp_path / 'rows.parquet'}', row {1 if n_left == 0 else 2}: ")
-    assert said in line
-    assert f"{3 - n_left} of 3 rows are left out" in line
-
-
-SMALL = {
-    "surrogate": {"reason": "\ud800"}, "status": {"status": 5}, "true": {"seed": True}, "big": {"bias": 10**400},
-    "extra": {"extra": {"a": [1]}}, "extra_big": {"extra": 2**70}, "date": {"stored_at": "x"}, "parameters": {"parameters": {"a": 1}},
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", SMALL)
-def test_a_spoilt_small_row_is_left_out_and_its_file_is_kept(tmp_path, capsys, name):
-    (tmp_path / "pending").mkdir()
-    good = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in row(seed=1).items()}
-    text = json.dumps([good, {**good, "key": "other", **SMALL[name]}])
-    (tmp_path / "pending" / "a.json").write_text(text)
-    store = Store(tmp_path, COLUMNS)
-    assert list(store.load()["key"]) == [good["key"]]
-    assert "row 2: " in capsys.readouterr().err
-    assert list(load(tmp_path)["key"]) == [good["key"]]
-    store.compact()
-    assert list(pd.read_parquet(tmp_path / "rows.parquet")["key"]) == [good["key"]]
-    (kept,) = tmp_path.glob("left_out-*.json")
-    assert kept.read_text() == text
+    path = tmp_path / "rows.parquet"
+    spoilt.to_parquet(path)
+    before, store = path.read_bytes(), Store(tmp_path, COLUMNS)
+    for act in (store.load, store.compact, lambda: store.append(row())):
+        with pytest.raises(StorageError) as caught:
+            act()
+        assert str(caught.value).startswith(f"'{path}', row {1 if is_whole else 2}: ")
+        assert said in str(caught.value)
+    assert path.read_bytes() == before
+    assert not list((tmp_path / "pending").glob("*.json"))
 
 
 @pytest.mark.parametrize("name", ["status", "samples", "repeats", "seed"])
-def test_rows_without_a_column_that_every_run_writes_are_left_out(tmp_path, capsys, name):
+def test_a_table_without_a_column_that_every_run_writes_is_refused(tmp_path, name):
     table([row(seed=i) for i in range(3)]).drop(columns=name).to_parquet(tmp_path / "rows.parquet")
-    (tmp_path / "pending").mkdir()
-    small = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in row(seed=5).items()}
-    (tmp_path / "pending" / "a.json").write_text(json.dumps([{k: v for k, v in small.items() if k != name}]))
-    assert Store(tmp_path, COLUMNS).load().empty
-    said = capsys.readouterr().err
-    assert f"row 1: {name} is missing; 3 of 3 rows are left out" in said
-    assert f"row 1: {name} is missing; 1 of 1 rows are left out" in said
-
-
-def test_a_table_with_rows_that_are_left_out_is_kept_when_it_is_replaced(tmp_path, capsys):
-    table([row(seed=0), row(seed=1) | {"status": "fine"}]).to_parquet(tmp_path / "rows.parquet")
-    before = (tmp_path / "rows.parquet").read_bytes()
-    store = Store(tmp_path, COLUMNS)
-    store.append(row(seed=2))
-    store.compact()
-    assert sorted(pd.read_parquet(tmp_path / "rows.parquet")["seed"]) == [0, 2]
-    (kept,) = tmp_path.glob("left_out-*.parquet")
-    assert kept.read_bytes() == before
-    assert "is kept as" in capsys.readouterr().err
+    with pytest.raises(StorageError, match=f"row 1: {name} is missing"):
+        Store(tmp_path, COLUMNS).load()
 
 
 def test_an_rmse_follows_from_bias_and_variance_whatever_was_stored(tmp_path):
