@@ -22,7 +22,6 @@ import numpy as np
 
 from bench.engines import server
 from bench.errors import Crashed, Unavailable, Unsupported, printable
-from bench.model import guard
 
 TAIL = 2000
 """Bytes of an engine's last output that a message quotes."""
@@ -52,7 +51,6 @@ class EngineProcess:
             raise Unavailable(f"python={python} cannot be started: {error.strerror}") from error
         finally:
             theirs.close()
-        guard.SPARED.add(self.process.pid)
 
     def end(self) -> str:
         """End the process, if it has not ended, and return how it ended, with its last output."""
@@ -70,7 +68,6 @@ class EngineProcess:
         """Kill the process and close its connection."""
         self.process.kill()
         self.process.communicate()
-        guard.SPARED.discard(self.process.pid)
         self.connection.close()
         self._output.close()
 

@@ -1,4 +1,4 @@
-"""Protects the process from side effects of plugins: working folder, forks, child processes and terminal output."""
+"""Protects the process from side effects of plugins: working folder, forks and terminal output."""
 
 from __future__ import annotations
 
@@ -18,8 +18,6 @@ MAX_CAPTURED_CHARACTERS = 300
 """Maximum number of characters of a plugin's output that are quoted."""
 DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of prctl(2)."""
-SPARED: set[int] = set()
-"""Ids of child processes that later cells use too, which :func:`kill_children` spares."""
 
 
 def die_with(parent: int) -> None:
@@ -119,26 +117,3 @@ def _working_folder() -> str:
         return os.getcwd()
     except FileNotFoundError:
         return ""
-
-
-def kill_children() -> None:
-    """Kill all child processes of this process, which a plugin has left running, except :data:`SPARED` ones."""
-    if not SPARED:
-        try:
-            # raises ChildProcessError if there are no children, which avoids a search through all processes
-            os.waitpid(-1, os.WNOHANG)
-        except ChildProcessError:
-            return
-    import psutil
-
-    # the children of a child are found before it is killed
-    own = [child for child in psutil.Process().children() if child.pid not in SPARED]
-    below = []
-    for child in own:
-        with contextlib.suppress(psutil.Error):
-            below += child.children(recursive=True)
-    for child in own + below:
-        with contextlib.suppress(psutil.Error):
-            child.kill()
-        with contextlib.suppress(ChildProcessError):
-            os.waitpid(child.pid, 0)

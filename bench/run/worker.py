@@ -71,7 +71,6 @@ def _serve(connection: Connection) -> None:
     while not getattr(handle, "is_tainted", False):  # the run continues in a new worker
         event, answer = _answer(connection, handle, _receive(connection))
         guard.exit_if_forked(pid)
-        guard.kill_children()
         with suppress(Exception):  # a plugin may have closed or replaced it
             sys.stdout.flush()
         _send(connection, event, **answer)

@@ -1,5 +1,7 @@
 """The rule of when to trust a gradient: it is counted as it says."""
 
+import json
+
 import pandas as pd
 from bench.plugins.studies.bias_variance import trust
 from helpers import row, table
@@ -18,6 +20,37 @@ def test_rules_count_what_they_pass_and_what_they_hold_back():
     found = trust.score_rules(rows()).set_index("rule")
     counts = ["trusted", "of those wrong", "right ones not trusted"]
     assert found[counts].to_numpy().tolist() == [[4, 2, 0], [3, 2, 1], [2, 0, 0], [1, 0, 1]]
+
+
+def test_trusted_is_said_of_the_checked_program_at_the_same_theta_and_backend(tmp_path):
+    made = rows().assign(parameters=lambda frame: [parameters(sigma) for sigma in (0.1, 0.2, 0.3, 0.4)])
+    checked = pd.DataFrame(
+        {"parameters": [parameters(0.4), parameters(0.1), parameters(0.1)], "untrusted": [1.0, 0.0, 0.0]}
+    )
+    (tmp_path / "gradcheck").mkdir()
+    checked.to_parquet(tmp_path / "gradcheck" / "rows.parquet")
+    answers = trust.trusted(tmp_path, made)
+    assert answers.tolist() == ["yes", "no", "no", "no"]
+    assert trust.headline(answers) == "trusted: fobg 1 yes, 3 no"
+    for changed in (
+        parameters(0.1, backend="torch"),
+        parameters(0.1, theta={"names": [], "at": [1.0]}),
+        parameters(0.5),
+    ):
+        answers = trust.trusted(tmp_path, made.iloc[:1].assign(parameters=changed))
+        assert answers.tolist() == ["not checked"]
+    assert trust.headline(answers) == "trusted: fobg 1 not checked; python -m bench gradcheck SCENE checks"
+    assert set(trust.trusted(tmp_path, made.assign(estimator="reinforce"))) == {""}
+
+
+def parameters(sigma, backend="jax", theta=None):
+    """The parameters of a row, as JSON."""
+    plugins = {
+        "scene": {"name": "pushing", "sigma": sigma},
+        "backend": {"name": backend},
+        "estimator": {"name": "fobg"},
+    }
+    return json.dumps(plugins | {"contact": None, "integrator": None, "theta": theta})
 
 
 def test_only_cells_with_an_error_of_the_estimators_asked_for_count(tmp_path, capsys):

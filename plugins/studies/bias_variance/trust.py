@@ -8,18 +8,23 @@ not trust.
 
 from __future__ import annotations
 
+import json
+import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from bench.experiment.parameters import parsed
 from bench.report.tables import plain_markdown
 from bench.report.text import number
+from bench.run.rows import read_parquet
 
-from .. import SPREAD
+from .. import PARTS, SPREAD
 from .columns import COLUMNS
 
 WRONG = 0.5
@@ -43,6 +48,36 @@ def spread(rows: pd.DataFrame) -> pd.Series:
 def stable(rows: pd.DataFrame) -> pd.Series:
     """Return whether each row has no remark. A remark on heavy tails points to an unstable step."""
     return rows["reason"] == ""
+
+
+def trusted(folder: Path, rows: pd.DataFrame) -> pd.Series:
+    """Return whether each row of ``fobg`` can be trusted: ``yes``, ``no`` or ``not checked``; empty for others and without a result.
+
+    Yes: an estimate spreads by less than half of its mean, and `gradcheck` has found nothing against the same program at the
+    same theta, by the rows stored below a results ``folder``.
+    """
+    untrusted: dict[str, float] = {}
+    for path in sorted(folder.glob("*/rows.parquet")):
+        with suppress(Exception):  # no results of a gradient check, or a damaged file
+            table = read_parquet(path, ["parameters", "untrusted"])
+            for program, count in zip(table["parameters"].map(_program), table["untrusted"], strict=True):
+                untrusted[program] = max(count, untrusted.get(program, 0.0))
+    found = rows["parameters"].map(lambda text: untrusted.get(_program(text), math.nan))
+    answers = np.select([(spread(rows) >= SPREAD) | (found > 0), found == 0], ["no", "yes"], "not checked")
+    return pd.Series(answers, rows.index).where((rows["estimator"] == "fobg") & (rows["status"] == "ok"), "")
+
+
+def _program(text: str) -> str:
+    """Return what the parameters of a row say of its program and theta."""
+    return json.dumps([parsed(text).get(part) for part in (*PARTS, "theta")])
+
+
+def headline(answers: pd.Series) -> str:
+    """Return in how many rows of ``fobg`` the estimates can be trusted; empty without any."""
+    counts = {answer: int((answers == answer).sum()) for answer in ("yes", "no", "not checked")}
+    how = "; python -m bench gradcheck SCENE checks" * bool(counts["not checked"])
+    listed = ", ".join(f"{count} {answer}" for answer, count in counts.items() if count)
+    return f"trusted: fobg {listed}{how}" if listed else ""
 
 
 RULES: Mapping[str, Callable[[pd.DataFrame], Any]] = {

@@ -20,7 +20,7 @@ from bench.report.problems import ProblemRows
 from bench.report.text import axis_value, counted, number, span
 from bench.report.views import Arranged, arrange, estimator_curves, pareto, shown_rmse
 
-from . import charts, descents, time_to_accuracy
+from . import charts, descents, time_to_accuracy, trust
 from .columns import COLUMNS
 from .comparisons import COLUMNS as COMPARED
 from .comparisons import (
@@ -46,6 +46,7 @@ RESULTS = ("variance", "cosine", "rollouts", "gradients", "reference_method")
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
     """Return the tables and charts of the rows; None if no cell was run."""
     rows = descents.with_start_norm(rows)
+    rows = rows.assign(trusted=trust.trusted(experiment.results_dir, rows))
     costed = with_gradient_cost(rows)
     shown = arrange(experiment, costed)
     methods = method_table(shown)
@@ -64,6 +65,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
             *(COLUMNS.by_name[name] for name in RESULTS),
         ],
         remarks=loose_references(rows, experiment.reference.tolerance),
+        headline=trust.headline(rows["trusted"]),
     )
 
 
