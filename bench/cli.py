@@ -305,14 +305,16 @@ def _plan(words: list[str]) -> int:
 
     from bench.experiment import config
     from bench.run import plan, progress
-    from bench.run.execute import store_of
+    from bench.run.execute import missing_references, store_of
 
     experiment = _load(words)
     store = store_of(experiment)
     rows = store.load()
     if rows.empty:  # times of the standard results, on another machine, are better than none
         rows = store_of(replace(experiment, results_dir=config.config_dir().parent / "results" / "standard")).load()
-    progress.print_plan(experiment, plan.plan(experiment, store), rows)
+    planned = plan.plan(experiment, store)
+    n_references = len(missing_references(experiment, [item.cell for item in planned if item.runs]))
+    progress.print_plan(experiment, planned, rows, n_references)
     return 0
 
 

@@ -127,6 +127,15 @@ def _refuse_without_supported_cells(experiment: Experiment, planned: Sequence[Pl
         raise UserError(f"no cell can be run: {'; '.join(map(str, reasons))}")
 
 
+def missing_references(experiment: Experiment, cells: Sequence[Cell]) -> list[Cell]:
+    """Return one cell for each reference to compute; closed forms are computed when their cells are measured."""
+    references = Session(experiment).references
+    # reversed twice, so that the first cell of each key remains, in the planned order
+    first = {cell.reference_key: cell for cell in reversed(cells) if cell.budget is not None}
+    with guard.contained():  # this calls backends, to find out which can compute references
+        return [cell for cell in reversed(first.values()) if not references.stored(cell) and not _has_closed_form(cell)]
+
+
 def _compact(store: Store, planned: Sequence[Planned]) -> None:
     """Merge the small files. A failure is only printed: it loses no row, and an error would hide why the run ended."""
     try:
@@ -157,8 +166,7 @@ class Runner:
         if refused:
             self._finish([(cell, result | {"machine": kind_of_machine()}) for cell, result in refused])
         cells = self._placed([item.cell for item in due if item.refusal is None])
-        with guard.contained():  # this calls backends, to find out which can compute references
-            references = self._missing_references(cells)
+        references = missing_references(self.experiment, cells)
         if not self.experiment.timing:
             with launcher_of(self.experiment) as launcher:
                 self._measure(self._compute_references(cells, references, launcher), launcher)
@@ -201,13 +209,6 @@ class Runner:
                 reason = {"status": "unsupported", "reason": f"no descent: {found.reason if found else ''}"}
                 self._finish([(cell, failed.get(key, reason | {"machine": kind_of_machine()}))])
         return placed
-
-    def _missing_references(self, cells: list[Cell]) -> list[Cell]:
-        """Return one cell for each reference to compute; closed forms are computed when their cells are measured."""
-        references = Session(self.experiment).references
-        # reversed twice, so that the first cell of each key remains, in the planned order
-        first = {cell.reference_key: cell for cell in reversed(cells) if cell.budget is not None}
-        return [cell for cell in reversed(first.values()) if not references.stored(cell) and not _has_closed_form(cell)]
 
     def _compute_references(self, cells: list[Cell], references: list[Cell], launcher: Launcher) -> list[Cell]:
         """Compute references and return the cells to measure; cells whose reference failed are stored with its status."""

@@ -137,8 +137,8 @@ def print_others(experiment: Experiment, planned: Sequence[Planned], keys: Itera
         )
 
 
-def print_plan(experiment: Experiment, planned: Sequence[Planned], rows: pd.DataFrame) -> None:
-    """Print the number of cells, how many are stored, to run and refused, the reasons, and the expected time."""
+def print_plan(experiment: Experiment, planned: Sequence[Planned], rows: pd.DataFrame, n_references: int) -> None:
+    """Print the number of cells, how many are stored, to run and refused, the reasons, the references to compute, and the expected time."""
     if not planned:
         print(empty_shard(experiment))
         return
@@ -150,6 +150,12 @@ def print_plan(experiment: Experiment, planned: Sequence[Planned], rows: pd.Data
     print_stale(planned)
     for reason, count in Counter(f"{status}: {reason}" for status, reason in refusals).most_common():
         print(f"  {count} {reason}")
+    if n_references:
+        most = experiment.reference
+        points = min(most.points, 64 * most.samples)
+        print(
+            f"references to compute: {n_references}, each of at most {most.samples:,} samples and {points:,} points of quadrature"
+        )
     if runs:
         seconds = expected_seconds(runs, rows)
         known = f"about {seconds:.0f} s of one worker, without new references"

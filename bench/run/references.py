@@ -172,7 +172,8 @@ def load(path: Path) -> Reference | None:
         return None
     try:
         table = read_parquet(path)
-        rows = {name: np.stack(list(part)) for name, part in table.groupby("part")["gradient"]}
+        # a file has None for NaN
+        rows = {name: np.array([*part], dtype=np.float64) for name, part in table.groupby("part")["gradient"]}
         vectors = {name: rows[name][0] for name in ("plain", "physical") if name in rows}
         return Reference(rows["batch"], **vectors, **table.loc[0, list(SCALARS)])
     except Exception:

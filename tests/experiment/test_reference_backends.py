@@ -64,6 +64,12 @@ def test_stored_reference_is_the_same(tmp_path):
     assert again.model_error == reference.model_error == pytest.approx(3**0.5)
 
 
+def test_a_reference_that_is_not_a_number_is_read_as_one(tmp_path):
+    """Parquet has null for it, and other workers and later runs read the file."""
+    save(Reference(np.full((1, 2), np.nan), "sampling[failed: costs]", np.nan), tmp_path / "r.parquet")
+    assert not load(tmp_path / "r.parquet").is_finite
+
+
 def test_scene_names_its_backends():
     class Plain(Cubic):
         backends = ("numpy", "torch")

@@ -7,6 +7,7 @@ import pytest
 from rich.cells import cell_len
 from rich.console import Console
 
+from bench.cli import main
 from bench.experiment import config
 from bench.run import launchers, progress
 from bench.run.execute import execute
@@ -71,3 +72,15 @@ def test_references_are_counted_while_they_are_computed(tmp_path, monkeypatch):
     assert counted[0].endswith("(0 of 2 references done)")
     assert any(line.endswith("(1 of 2 references done)") for line in counted)
     assert not any("references done" in line for line in lines if not line.startswith("reference"))
+
+
+def test_a_plan_counts_references_until_they_are_stored(tmp_path, capsys):
+    words = [*PUSHING, f"results_dir={tmp_path}"]
+    assert main(["plan", *words]) == 0
+    assert (
+        "references to compute: 1, each of at most 256 samples and 16,384 points of quadrature"
+        in capsys.readouterr().out
+    )
+    execute(config.load(words))
+    assert main(["plan", *words, "samples=9"]) == 0
+    assert "references" not in capsys.readouterr().out.replace("without new references", "")
