@@ -9,13 +9,15 @@ import os
 import signal
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import IO
 
-from bench.errors import INTERRUPTED, printable
+from bench.errors import INTERRUPTED, UserError, printable
 
 MAX_CAPTURED_CHARACTERS = 300
 """Maximum number of characters of a plugin's output that are quoted."""
+LIBRARIES = ("bench", "builtins", "json", "math", "numpy", "os", "pandas", "scipy")
+"""Packages whose functions compute or store numbers in the process of a command."""
 DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of prctl(2)."""
 
@@ -58,9 +60,35 @@ def protect_process() -> Iterator[None]:
 
 @contextlib.contextmanager
 def contained() -> Iterator[None]:
-    """Run code of plugins in the block: :func:`capture_output` and :func:`protect_process`."""
+    """Run code of plugins in the block: :func:`capture_output` and :func:`protect_process`.
+
+    Raises :class:`UserError` if it has replaced a function of a library that computes numbers of other plugins too.
+    """
+    from bench.model import registry
+
+    before = library_functions() if registry.IMPORTED else {}
     with capture_output("a plugin"), protect_process():
         yield
+    if before and (name := replaced(before)):
+        raise UserError(
+            f"a plugin has replaced {name} in the process of this command: correct the plugin, or leave it out"
+        )
+
+
+def library_functions() -> dict[tuple[str, str], object]:
+    """Return the functions and classes of the imported :data:`LIBRARIES` by names of module and attribute, and the modules."""
+    found: dict[tuple[str, str], object] = {}
+    for name, module in [*sys.modules.items()]:
+        if name.partition(".")[0] in LIBRARIES:
+            found[name, ""] = module
+            found |= {(name, key): one for key, one in [*getattr(module, "__dict__", {}).items()] if callable(one)}
+    return found
+
+
+def replaced(before: Mapping[tuple[str, str], object]) -> str:
+    """Return the name of one of :func:`library_functions` that is another now; empty if all are the same."""
+    now = library_functions()
+    return next((".".join(filter(None, name)) for name, one in before.items() if now.get(name) is not one), "")
 
 
 def raise_pending_interrupt() -> None:

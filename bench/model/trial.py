@@ -1,6 +1,6 @@
-"""Imports plugin files from outside in a separate process first, so that no import can end a command.
+"""Imports plugin files from outside in a separate process first, so that no import can end a command or change its numbers.
 
-A crash, ``os._exit`` or an endless loop cannot be caught within its own process. A child process therefore imports each
+A function of a library that a file replaces would compute numbers of other plugins too. A crash, ``os._exit`` or an endless loop cannot be caught within its own process. A child process therefore imports each
 file, once in a command. It writes a line before each, so the last one is the file that has ended it.
 """
 
@@ -22,6 +22,8 @@ from bench.model import guard
 
 TIMEOUT_S = 60.0
 """Time limit of the import of a file, in seconds."""
+MAX_NAME = 200
+"""Characters that are read of the name of a function that a file has replaced."""
 MARK = "BENCH_TRIAL"
 """Environment variable of a trial process and all processes that it starts."""
 CHILD_CODE = (
@@ -34,7 +36,7 @@ CHILD_CODE = (
 def find_fatal_modules(
     modules: Sequence[str], packages: Mapping[str, Path], timeout_s: float = TIMEOUT_S
 ) -> dict[str, str]:
-    """Return the failure message of each module that ended or blocked the trial process, by module name.
+    """Return the failure message of each module that ended, blocked or changed the trial process, by module name.
 
     ``packages`` maps package names of plugin folders to the folders. A module that only raises an exception is not fatal.
     """
@@ -61,6 +63,7 @@ def run_child(job: Mapping[str, Any]) -> None:
     for name, folder in job["packages"].items():
         sys.modules[name] = package = ModuleType(name)
         package.__path__ = [folder]
+    before = guard.library_functions()
     for name in job["modules"]:
         os.write(output, b"\n")
         signal.setitimer(signal.ITIMER_REAL, job["timeout_s"])  # which ends this process
@@ -68,6 +71,9 @@ def run_child(job: Mapping[str, Any]) -> None:
             importlib.import_module(name)
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         guard.exit_if_forked(pid)
+        if changed := guard.replaced(before):
+            os.write(output, changed.encode())
+            os._exit(1)
     os.write(output, b"!")
     os._exit(0)  # without waiting for threads that a plugin has left running
 
@@ -86,10 +92,12 @@ def _try_imports(names: Sequence[str], packages: Mapping[str, Path], timeout_s: 
         finally:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
-        written = os.pread(output.fileno(), len(names) + 1, 0)
-    code, n_started = process.wait(), written.count(b"\n")
-    if written.endswith(b"!"):
+        written = os.pread(output.fileno(), len(names) + MAX_NAME, 0)
+    code, n_started, last = process.wait(), written.count(b"\n"), written.rpartition(b"\n")[2].decode()
+    if last == "!":
         return n_started, ""
+    if last:
+        return n_started, f"replaced {last} when it was imported"
     cause = f"ended the process {f'by {signal.Signals(-code).name}' if code < 0 else f'(exit status {code})'}"
     if code == -signal.SIGALRM:
         cause = f"did not return within {timeout_s:g} s"

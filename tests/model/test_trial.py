@@ -3,16 +3,19 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from trees import INHERITED, bench
 
-from bench.errors import failure, printable
-from bench.model import registry, trial
+from bench.errors import UserError, failure, printable
+from bench.model import guard, registry, trial
 
 GOOD = "from bench.model import SampleMean\n"
 FATAL = {
     "exits": ("import os\nos._exit(0)\n", "ended the process (exit status 0)"),
     "crashes": ("import ctypes\nctypes.string_at(0)\n", "ended the process by SIGSEGV when it was imported"),
+    "patches": ("import numpy\nnumpy.sqrt = numpy.cbrt\n", "replaced numpy.sqrt when it was imported"),
+    "hides": ("import sys\nsys.modules['json'] = None\n", "replaced json when it was imported"),
 }
 ODD = "from bench.model import SampleMean\nclass Odd(SampleMean):\n    name = 'odd'\n    requires = None\n"
 
@@ -55,6 +58,12 @@ def test_listed_with_what_happened_and_the_others_are_listed_too(folder):
     assert done.stdout.count("  fobg ") == 1  # a forked copy does not go on
     for name in ("odd_one", "odd_two"):  # their classes are called alike
         assert f"{name}.Odd" in done.stdout
+
+
+def test_a_function_that_a_plugin_replaces_while_cells_are_planned_ends_the_command(monkeypatch):
+    monkeypatch.setattr(registry, "IMPORTED", {"from_outside"})
+    with pytest.raises(UserError, match=r"a plugin has replaced numpy\.sqrt"), guard.contained():
+        monkeypatch.setattr(np, "sqrt", np.cbrt)
 
 
 @pytest.mark.slow
