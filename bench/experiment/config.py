@@ -314,8 +314,8 @@ def from_settings(config: Mapping[str, Any]) -> Experiment:
         descent=share_of(config["descent"]),
         path=_path(config["path"]),
         results_dir=_folder(config["results_dir"]),
-        question=_text(config, "question"),
-        answer=_text(config, "answer"),
+        question=str(config["question"] or ""),
+        answer=str(config["answer"] or ""),
         marks=_mapping(config, "marks"),
         compares=_compares(config),
         formats=tuple(_one_of("formats", item, FORMATS) for item in _as_list(config["formats"])),
@@ -331,12 +331,6 @@ def _compares(config: Mapping[str, Any]) -> dict[str, list[Any]]:
     given = {name: _as_list(values) for name, values in _mapping(config, "compares").items()}
     kinds = registry.kinds()
     return {name: [str(_choice(name, v)) if name in kinds else v for v in values] for name, values in given.items()}
-
-
-def _text(config: Mapping[str, Any], key: str) -> str:
-    if isinstance(config[key], list | dict):
-        raise UserError(f"{key}={printable(config[key])[:100]} must be a string")
-    return str(config[key] or "")
 
 
 def _name(config: Mapping[str, Any]) -> str:

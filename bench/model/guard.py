@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from typing import IO
 
-from bench.errors import INTERRUPTED, UserError, printable
+from bench.errors import FOLDER, INTERRUPTED, UserError, printable
 
 MAX_CAPTURED_CHARACTERS = 300
 """Maximum number of characters of a plugin's output that are quoted."""
@@ -64,9 +64,7 @@ def contained() -> Iterator[None]:
 
     Raises :class:`UserError` if it has replaced a function of a library that computes numbers of other plugins too.
     """
-    from bench.model import registry
-
-    before = library_functions() if registry.IMPORTED else {}
+    before = library_functions() if any(name.startswith(FOLDER) for name in sys.modules) else {}
     with capture_output("a plugin"), protect_process():
         yield
     if before and (name := replaced(before)):

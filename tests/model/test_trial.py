@@ -2,12 +2,13 @@
 
 import subprocess
 import sys
+from types import ModuleType
 
 import numpy as np
 import pytest
 from trees import INHERITED, bench
 
-from bench.errors import UserError, failure, printable
+from bench.errors import FOLDER, UserError, failure, printable
 from bench.model import guard, registry, trial
 
 GOOD = "from bench.model import SampleMean\n"
@@ -61,7 +62,7 @@ def test_listed_with_what_happened_and_the_others_are_listed_too(folder):
 
 
 def test_a_function_that_a_plugin_replaces_while_cells_are_planned_ends_the_command(monkeypatch):
-    monkeypatch.setattr(registry, "IMPORTED", {"from_outside"})
+    monkeypatch.setitem(sys.modules, f"{FOLDER}0.mine", ModuleType("mine"))
     with pytest.raises(UserError, match=r"a plugin has replaced numpy\.sqrt"), guard.contained():
         monkeypatch.setattr(np, "sqrt", np.cbrt)
 
