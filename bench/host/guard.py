@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from typing import IO
 
-from bench.errors import INTERRUPTED, UserError, printable
+from bench.errors import FOLDER, INTERRUPTED, UserError, printable
 
 MAX_CAPTURED_CHARACTERS = 300
 """Maximum number of characters of a plugin's output that are quoted."""
@@ -38,13 +38,13 @@ def exit_if_forked(pid: int) -> None:
 
 @contextlib.contextmanager
 def protect_process() -> Iterator[None]:
-    """Restore the working folder and the import path after plugin code in the block, and exit processes that it has forked.
+    """Restore the working folder, the import path and the recursion limit after plugin code in the block, and exit its forks.
 
-    What the plugin has added to the import path follows it.
+    What the plugin has added to the import path follows it, and it may raise the limit.
 
     Raises KeyboardInterrupt at the end if the plugin has swallowed one.
     """
-    pid, folder, path = os.getpid(), _working_folder(), [*sys.path]
+    pid, folder, path, depth = os.getpid(), _working_folder(), [*sys.path], sys.getrecursionlimit()
     try:
         yield
     except KeyboardInterrupt:
@@ -55,6 +55,7 @@ def protect_process() -> Iterator[None]:
         if folder and _working_folder() != folder:
             os.chdir(folder)
         sys.path[:] = dict.fromkeys([*path, *sys.path])
+        sys.setrecursionlimit(max(depth, sys.getrecursionlimit()))
     raise_pending_interrupt()
 
 
@@ -64,9 +65,7 @@ def contained() -> Iterator[None]:
 
     Raises :class:`UserError` if it has replaced a function of a library that computes numbers of other plugins too.
     """
-    from bench.model import registry
-
-    before = library_functions() if registry.IMPORTED else {}
+    before = library_functions() if any(name.startswith(FOLDER) for name in sys.modules) else {}
     with capture_output("a plugin"), protect_process():
         yield
     if before and (name := replaced(before)):

@@ -93,7 +93,7 @@ def _try_imports(names: Sequence[str], packages: Mapping[str, Path], timeout_s: 
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
         written = os.pread(output.fileno(), len(names) + MAX_NAME, 0)
-    code, n_started, last = process.wait(), written.count(b"\n"), written.rpartition(b"\n")[2].decode()
+    code, n_started, last = process.wait(), written.count(b"\n"), written.rpartition(b"\n")[2].decode(errors="replace")
     if last == "!":
         return n_started, ""
     if last:

@@ -34,7 +34,7 @@ REFUSED = {
     "marks={nosuch:{a:1}}": "unknown mark 'nosuch' (allowed: ",
     "compare . . agian=a": "did you mean 'again'", "compare --output=/tmp/x .": "unknown option of compare '--output=/tmp/x'",
     "history . . output=x": "did you mean 'out'", "compares={nosuch:[1]}": "unknown part of compares 'nosuch' (allowed: ",
-    "study=[bias_variance]": "study=[bias_variance] must be one name", "x" * 5000: "unknown command", "also=3": "also=3 must be a string", "question={a:1}": "must be a string",
+    "study=[bias_variance]": "study=[bias_variance] must be one name", "x" * 5000: "unknown command", "also=3": "also=3 must be a string",
     "scenes=[heaviside[sigma=1,sigma=2]]": "'sigma' has two values", "name=" + "x" * 300: "must be at most 100 letters", "compile_cache=/dev/null": "is not a folder",
     # values
     "scenes=[]": "scenes is empty", "scenes=[pushing] sweep.stiffness=[abc]": "must be a number",

@@ -2,14 +2,14 @@
 
 import subprocess
 import sys
+from types import ModuleType
 
 import numpy as np
 import pytest
 from trees import INHERITED, bench
 
-from bench.errors import UserError, failure, printable
-from bench.host import guard, trial
-from bench.model import registry
+from bench.errors import FOLDER, UserError, failure, printable
+from bench.host import guard, registry, trial
 
 GOOD = "from bench.model import SampleMean\n"
 FATAL = {
@@ -61,8 +61,19 @@ def test_listed_with_what_happened_and_the_others_are_listed_too(folder):
         assert f"{name}.Odd" in done.stdout
 
 
+def test_a_plugin_may_raise_the_recursion_limit_and_not_lower_it():
+    before = sys.getrecursionlimit()
+    with guard.protect_process():
+        sys.setrecursionlimit(before - 100)
+    assert sys.getrecursionlimit() == before
+    with guard.protect_process():
+        sys.setrecursionlimit(before + 100)
+    assert sys.getrecursionlimit() == before + 100
+    sys.setrecursionlimit(before)
+
+
 def test_a_function_that_a_plugin_replaces_while_cells_are_planned_ends_the_command(monkeypatch):
-    monkeypatch.setattr(registry, "IMPORTED", {"from_outside"})
+    monkeypatch.setitem(sys.modules, f"{FOLDER}0.mine", ModuleType("mine"))
     with pytest.raises(UserError, match=r"a plugin has replaced numpy\.sqrt"), guard.contained():
         monkeypatch.setattr(np, "sqrt", np.cbrt)
 
