@@ -14,12 +14,15 @@ from typing import Any, cast
 
 import pandas as pd
 from bench.plugins.studies.bias_variance.comparisons import FAILS, OPEN
+from PIL import Image
 
 import bench
 import bench.plugin
 from bench.errors import UserError
 from bench.host.parameters import parameters
 from bench.model import registry
+from bench.report.draw import NARROW
+from bench.report.figures import DPI
 from bench.report.tables import escape_markdown
 from bench.report.text import number
 from docs.figures import without_marks
@@ -186,7 +189,7 @@ def experiment_page(entry: Entry) -> str:
     if entry.answer:
         parts.append(f"{{.finding}}\n{escape_markdown(entry.answer)}")
     if entry.chart:
-        parts.append(f"![{escape_markdown(entry.question)}]({folder}/{entry.chart.name})")
+        parts.append(picture(entry.chart, entry.question))
     parts += ["## Run it", f"    {entry.command}", "Or write its page from the stored rows:"]
     parts += [f"    {entry.command.replace('bench', 'bench report', 1)} results_dir=results/standard", entry.made]
     for path in entry.tables:
@@ -194,12 +197,19 @@ def experiment_page(entry: Entry) -> str:
         parts.append(f"## {path.stem.replace('_', ' ').capitalize()}\n\n{table}" if table else "")
     if more := [path for path in entry.charts if path != entry.chart]:
         parts.append("## More charts")
-        parts += [f"### {path.stem.replace('_', ' ')}\n\n![{path.stem}]({folder}/{path.name})" for path in more]
+        parts += [f"### {path.stem.replace('_', ' ')}\n\n{picture(path, path.stem)}" for path in more]
     parts += [
         "## Data",
         "\n".join(f"- {download(path.name, f'{folder}/{path.name}')}: {text}" for path, text in entry.data()),
     ]
     return "\n\n".join(filter(None, parts)) + "\n"
+
+
+def picture(path: Path, description: str) -> str:
+    """Return a chart of an experiment; one of several panels is not made smaller on phones, but scrolls."""
+    with Image.open(path) as image:
+        look = "{.wide}\n" if image.width > DPI * NARROW else ""
+    return f"{look}![{escape_markdown(description)}](/data/{path.parent.name}/{path.name})"
 
 
 LONGEST = 30

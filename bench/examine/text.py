@@ -53,9 +53,9 @@ def conclusion(report: Findings) -> str:
 
 
 def noise_answer(report: Findings) -> str:
-    """Return the answer about the gradient under noise in one line; empty without a gradient."""
+    """Return the answer about the gradient under noise in one line; without one, what noise meets and smoothing takes."""
     if not report.gradient:
-        return ""
+        return _costs_under_noise(report)
     cause, setup, known = report.noise_cause, report.setup, [one for one in report.smoothed if one.known]
     is_problem, levels, fact = cause not in ("", "unmeasured"), setup.sigmas, ""
     if is_problem:
@@ -75,6 +75,22 @@ def noise_answer(report: Findings) -> str:
         else "Under noise"
     )
     return f"{where}: {report.use}{fact}"
+
+
+def _costs_under_noise(report: Findings) -> str:
+    """Return the number of jumps within the noise, and the calls that smoothing needs; empty without a sigma."""
+    setup, jumps = report.setup, sum(len(line.jumps) for line in report.lines)
+    if not setup.levels:
+        return ""
+    found = [f"{counted(jumps, 'jump')} within {REACH:g} sigma on {counted(len(report.lines), 'line')}"] * bool(
+        report.lines
+    )
+    best = {one.sigma: report.recommended(one) for one in report.smoothed}
+    found += [
+        f"smoothing has an error of 10% after {method.calls:.0f} calls at sigma {setup.shown(sigma)}"
+        for sigma, method in best.items() if method
+    ] or ["what smoothing needs is not known"]  # fmt: skip
+    return f"Under noise of sigma {', '.join(map(setup.shown, setup.sigmas))}: {', '.join(found)}"
 
 
 def warnings(report: Findings) -> list[str]:

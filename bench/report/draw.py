@@ -38,7 +38,7 @@ LINE = 0.155
 """Height of a line of text in inches."""
 BOLD = 1.3
 """Width of a bold title relative to the same text elsewhere."""
-UPWARDS = (1.0, 1.6, 2.4, 3.2)
+UPWARDS = (1.0, 1.6, 2.4, 3.2, math.inf)
 """Lengths in inches of labels that read upwards, the first that fits."""
 DOT = 0.075
 """Height in inches of a series in a row of dots."""
@@ -471,13 +471,14 @@ def _draw_grid(
     names = _categories(x, part if chart.own_scales else chart.frame)
     room = width / max(len(names), 1)
     widest = max(map(width_in_inches, map(str, chart.frame[chart.cell])), default=0.0) if chart.cell else 0.0
-    size = min(SIZE - 1, 0.8 * 72 * room, SIZE * 0.92 * room / max(widest, 0.1))
+    has_text = chart.cell and min(0.8 * 72 * room, SIZE * 0.92 * room / max(widest, 0.1)) >= SIZE - 1
     for line in part.to_dict("records"):
         at = names.index(_category(line[x.name])), place[_category(line[y.name])]
         face = styles[str(line[chart.level])].colour
         panel.add_patch(Rectangle((at[0] - 0.5, at[1] - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=0.8))
-        text = plain(str(line[chart.cell])) if chart.cell else ""
-        panel.text(*at, text, ha="center", va="center", color=ink_on(face), fontsize=size)
+        if has_text:  # smaller ones would not be readable
+            text = plain(str(line[chart.cell]))
+            panel.text(*at, text, ha="center", va="center", color=ink_on(face), fontsize=SIZE - 1)
     if chart.limit:
         heights = pd.Series(
             {value: place[_category(value)] for value in sorted(part[y.name].dropna().unique())}, dtype=float

@@ -24,6 +24,8 @@ from bench.run.files import write_all
 
 ANSWER = "answer.json"
 """The file with an experiment's question, answer and main chart."""
+NO_ANSWER = "No answer is written for these settings: the tables have the results."
+"""What the terminal shows where an experiment has a question, and its answer is missing or is of other settings."""
 LEAST = 3
 """Fewest values that are drawn."""
 
@@ -122,8 +124,8 @@ def show(experiment: Experiment, rows: pd.DataFrame, views: Views) -> None:
     counts = rows["status"].value_counts()
     console.print(f"{counted(len(rows), 'cell')}: " + ", ".join(f"{n} {status}" for status, n in counts.items()))
     headline = one_line(views.headline)
-    if headline:
-        console.print(headline)
+    if headline or experiment.question:
+        console.print(headline or NO_ANSWER)
     for table in views.tables:
         if table.terminal:
             right = {column.heading for column in table.columns if column.kind == "number"}

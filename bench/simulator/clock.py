@@ -190,8 +190,9 @@ class Clock:
     def _show_progress(self, force: bool = False) -> None:
         if self._shown and (force or self.elapsed - self._last_shown > PROGRESS_INTERVAL_S):
             self._last_shown = self.elapsed
-            limit = f"{self.budget:.0f} s" if math.isfinite(self.budget) else f"{self.calls:,.0f} calls"
-            text = f"{self._stage}: {self.costs} costs, {self.gradients} gradients, {self.spent:.0f} s of {limit}"
+            limit = f" of {self.calls:,.0f} calls" * math.isfinite(self.calls)
+            limit += f", {self.spent:.0f} s" + f" of {self.budget:.0f} s" * math.isfinite(self.budget)
+            text = f"{self._stage}: {self.costs} costs, {self.gradients} gradients{limit}"
             print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
 
     def clear_progress(self) -> None:

@@ -64,6 +64,18 @@ def test_an_estimator_keeps_its_look_whatever_else_is_drawn():
     assert method_styles(["fobg, adam"])["fobg, adam"] == found["fobg"]
 
 
+def test_a_search_keeps_its_look_and_differs_from_the_estimators_beside_it():
+    """cem was pink, black and orange in three experiments, and ppo another colour as a trainer."""
+    searches = ["cem[population=40]", "cma_es", "mppi", "ppo[population=40]"]
+    found = method_styles([*searches, "fobg, adam", "reinforce, adam", "windowed, adam", "randomized_smoothing, lbfgs"])
+    assert (
+        len({style.colour for name, style in found.items() if name not in ("mppi", "randomized_smoothing, lbfgs")}) == 6
+    )
+    assert found["ppo[population=40]"] == method_styles(["ppo[rollouts=64]"])["ppo[rollouts=64]"]
+    trainers = method_styles(["bptt", "evolution", "ppo", "sep_cma_es", "shac"])
+    assert len({style.colour for style in trainers.values()}) == 5
+
+
 def test_a_name_has_one_colour_in_all_charts_of_an_experiment():
     """A search without an estimator was orange in one chart and brown in the next, by its place."""
     names = ["cma_es", "fobg, adam", "ppo"]
@@ -74,7 +86,7 @@ def test_a_name_has_one_colour_in_all_charts_of_an_experiment():
     ]  # fmt: skip
     found = [
         {line.get_label(): line.get_color() for line in figure.legends[0].get_lines()}
-        for _, figure in writer.drawings(experiment(), Views(charts=charts))
+        for _, (figure,) in writer.drawings(experiment(), Views(charts=charts))
     ]
     assert found == found[:1] * 3
     assert len(set(found[0].values())) == 3

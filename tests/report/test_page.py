@@ -107,7 +107,7 @@ def test_numbers_keep_six_digits_and_missing_ones_are_null():
 
 def test_page_asks_for_nothing_and_stays_small(text):
     assert len(text) < 5e5
-    assert text.count("<svg") == 2
+    assert text.count("<svg") == text.count('class="drawing ') >= 2
     assert not re.search(r'(src|href)="(?!#)', text.partition('id="data"')[0])
     assert "default-src 'none'" in text
 
@@ -216,13 +216,13 @@ def test_a_row_selects_the_cell_and_shows_its_command(shown):
     assert shown.do("document.getElementById('cell').hidden")
 
 
-def test_keyboard_reaches_drawings_filters_headings_and_rows(shown):
+def test_keyboard_reaches_filters_headings_and_rows(shown):
     shown.do("document.querySelector('.skip').focus()")
     active = "document.activeElement"
     reached = set()
     for _ in range(60):
         shown.press("Tab")
-        reached.add(shown.do(f"{active}.closest('#filters, #find, #csv, .drawing, thead, tbody')?.tagName"))
+        reached.add(shown.do(f"{active}.closest('#filters, #find, #csv, thead, tbody')?.tagName"))
         assert shown.do(f"{active}.matches(':focus-visible')")
         assert float(shown.do(f"getComputedStyle({active}).outlineWidth").removesuffix("px")) >= 2
     assert {"BUTTON", "DIV", "INPUT", "THEAD", "TBODY"} <= reached
@@ -238,7 +238,7 @@ def test_page_and_drawings_follow_the_theme_of_the_system(shown, dark):
 
 def test_a_drawing_says_what_it_is_has_texts_of_12_pixels_and_shares_no_id(shown):
     assert shown.do(f"[{SVG}.role, {SVG}.ariaLabel]") == ["img", "Bias variance stiffness"]
-    texts = "[...document.querySelectorAll('.drawing text')].filter((one) => !one.querySelector('tspan'))"
+    texts = "[...document.querySelectorAll('.drawing:not(.narrow) text')].filter((one) => !one.querySelector('tspan'))"
     sizes = f"{texts}.map((one) => parseFloat(getComputedStyle(one).fontSize) * Math.hypot(one.getScreenCTM().c, one.getScreenCTM().d))"
     assert min(shown.do(sizes)) >= 12
     ids = shown.do("[...document.querySelectorAll('[id]')].map((one) => one.id)")
@@ -247,9 +247,30 @@ def test_a_drawing_says_what_it_is_has_texts_of_12_pixels_and_shares_no_id(shown
     assert shown.do(f"{targets}.every((id) => document.getElementById(id))")
 
 
+def test_on_a_phone_a_chart_is_one_panel_wide_with_texts_of_11_pixels(browser, tmp_path):
+    """A chart of three panels was two columns wide, and scrolled sideways."""
+    frame = pd.DataFrame({"x": [1.0, 2.0, 3.0] * 3, "panel": [*"aaabbbccc"]})
+    chart = Chart("three", frame, [Column("x")], [Column("x")], panel="panel")
+    made, rows = experiment(), small_rows()
+    browser.size(390, 3000)
+    browser.show(tmp_path, helpers.page(made, rows, replace(views_of(made, rows), charts=[chart])))
+    boxes = (
+        "[...document.querySelectorAll('.drawing')].map((one) => [one.className, one.getBoundingClientRect().width])"
+    )
+    widths = dict(browser.do(boxes))
+    assert widths["drawing wide"] == 0 < widths["drawing narrow"] <= 390
+    titles = "[...document.querySelectorAll('.drawing.narrow text')].filter((one) => 'abc'.includes(one.textContent))"
+    places = browser.do(
+        f"{titles}.map((one) => [one.getBoundingClientRect().x, parseFloat(getComputedStyle(one).fontSize) * one.getScreenCTM().a])"
+    )
+    assert len({round(x) for x, _ in places}) == 1
+    assert min(size for _, size in places) >= 11
+    browser.size(*WIDE)
+
+
 def test_texts_of_a_drawing_are_as_wide_as_they_were_measured(shown):
     """In another font labels would overlap."""
-    longest = "[...document.querySelectorAll('.drawing text')].map((one) => [one.textContent, one.getBBox().width])"
+    longest = "[...document.querySelectorAll('.drawing:not(.narrow) text')].map((one) => [one.textContent, one.getBBox().width])"
     text, width = max(shown.do(longest), key=lambda one: one[1] if "stiffness" in one[0] else 0)
     assert width / 72 == pytest.approx(width_in_inches(text), rel=0.03)
 

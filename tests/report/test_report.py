@@ -6,6 +6,7 @@ import math
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -29,13 +30,15 @@ from helpers import (
     table,
 )
 from matplotlib.figure import Figure
+from matplotlib.text import Text
+from PIL import Image
 
 from bench.experiment.axes import axes
-from bench.experiment.columns import Column
-from bench.experiment.views import Chart
+from bench.experiment.columns import Column, text
+from bench.experiment.views import Chart, Views
 from bench.report import latex, views, writer
-from bench.report.draw import EXACT, draw
-from bench.report.figures import save, styled
+from bench.report.draw import EXACT, NARROW, WIDTH, draw
+from bench.report.figures import DPI, save, styled
 from bench.report.problems import split_by_problem
 
 
@@ -307,6 +310,27 @@ def test_every_bias_and_interval_of_the_rows_is_in_the_data_of_the_chart(tmp_pat
         names = ["bias_shown", "bias_from", "bias_to"]
         near = np.isclose(found[names], ends.to_numpy(dtype=float), rtol=1e-6).all(axis=1)
         assert (found["series"][near] == cell["estimator"]).any()
+
+
+def test_charts_in_files_are_one_column_wide_on_request_with_texts_of_7_points(made):
+    """At 3.5 inches, panels beside each other and numbers in narrow cells were unreadable."""
+    frame = pd.DataFrame([
+        {"x": f"a long name {i}", "y": f"row {j}", "panel": p, "level": "good", "cell": "1234.5"}
+        for p in "ab" for i in range(9) for j in range(2)
+    ])  # fmt: skip
+    grid = Chart(
+        "grid", frame, [text("x", label="")], [text("y", label="")], "grid", panel="panel", level="level", cell="cell"
+    )
+    for columns, inches in ((2, WIDTH), (1, NARROW)):
+        given = replace(made, chart_columns=columns)
+        drawn = writer.drawings(given, Views(charts=[grid]))
+        paths = writer.write(given, Views(charts=[grid]), drawn)
+        with Image.open(next(path for path in paths if path.suffix == ".png")) as image:
+            assert image.width == pytest.approx(inches * DPI, abs=1)
+        ((_, figures),) = drawn
+        panels = [panel for figure in figures for panel in figure.axes]
+        assert min(one.get_fontsize() for panel in panels for one in panel.findobj(Text) if one.get_text()) >= 7
+        assert len({round(panel.get_position().x0, 3) for panel in figures[-1].axes}) == 1
 
 
 @pytest.mark.slow

@@ -21,6 +21,8 @@ from helpers import experiment, failed, row, table
 from bench.errors import UserError
 from bench.experiment import config
 from bench.report.cells import readable
+from bench.report.draw import draw
+from bench.report.figures import styled
 from bench.report.views import arrange
 
 
@@ -329,10 +331,12 @@ def test_time_to_an_error_is_drawn_per_backend_that_is_compared_and_with_what_ne
         for name, bias in (("fobg", {}), ("inverse_variance", never | {"rmse_rel": 0.5}))
     ]
     given = {"sweep": {"samples": [16, 64, 256, 1024]}, "compares": {"backends": ["jax", "mjx"]}}
-    frame = charts_of(cells, **given)["speed_accuracy"].frame.set_index(["panel", "series"])
-    assert frame.loc[("on mjx", "fobg"), "cost"] == pytest.approx(0.1, rel=0.05)
-    assert frame.loc[("on jax", "fobg"), "cost"] == pytest.approx(1e-3, rel=0.05)
-    assert frame.loc[[("on jax", "inverse_variance"), ("on mjx", "inverse_variance")], "lost"].all()
+    chart = charts_of(cells, **given)["speed_accuracy"]
+    assert (chart.y[0].name, chart.panel) == ("backend", "problem"), "the backends of a problem are rows of one panel"
+    frame = chart.frame.set_index(["backend", "series"])
+    assert frame.loc[("mjx", "fobg"), "cost"] == pytest.approx(0.1, rel=0.05)
+    assert frame.loc[("jax", "fobg"), "cost"] == pytest.approx(1e-3, rel=0.05)
+    assert frame.loc[[("jax", "inverse_variance"), ("mjx", "inverse_variance")], "lost"].all()
 
 
 def test_two_values_of_an_axis_are_joined_by_an_arrow():
@@ -343,6 +347,22 @@ def test_two_values_of_an_axis_are_joined_by_an_arrow():
     chart = charts_of(cells, compares={"stiffness": [1e2, 1e4], "estimators": ["fobg"]})["contrast"]
     assert chart.frame["stiffness"].tolist() == [1e2, 1e4]
     assert chart.frame["arrow"].nunique() == 1
+
+
+def test_below_the_errors_of_an_arrow_are_the_costs_of_the_same_rollouts():
+    """That costs look normal where a gradient is off by 1e5 was said, and not drawn. They are of rows that use costs."""
+    given = {"sweep": {"stiffness": [1e2, 1e3, 1e4]}, "compares": {"stiffness": [1e2, 1e4], "estimators": ["fobg"]}}
+    cells = along({"jax": (0.1, 1e-3)})
+    assert len(charts_of(cells, **given)["contrast"].y) == 1
+    costs = [one | {"cost": one["stiffness"], "cost_low": 1.0, "cost_high": 2e4}
+             for one in along({"jax": (0.2, 1e-3)}, estimator="reinforce")]  # fmt: skip
+    chart = charts_of([*cells, *costs], **given)["contrast"]
+    assert chart.frame["series"].unique().tolist() == ["fobg"]
+    assert chart.frame["cost"].tolist() == [1e2, 1e4]
+    with styled():
+        errors, below = draw(chart).axes
+    assert errors.get_xlim() == below.get_xlim()
+    assert below.get_ylabel() == "cost of a rollout"
 
 
 def test_what_a_command_line_chooses_is_drawn_whatever_the_file_compares():
