@@ -140,9 +140,8 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
             return other.costs(thetas, stages.same_noise(thetas.shape[1]))
 
         quick = FewSteps(
-            space, partial(space.costs, costs, width=other.width), gradient, float(costs(stages.theta[:, None])[0]),
-            simulator.unit, stages.repeats.spread,
-        )  # fmt: skip
+            space, costs, gradient, float(costs(stages.theta[:, None])[0]), simulator.unit, stages.repeats.spread
+        )
         quick.run_round(other.width)
         outcome = quick.check()
         if not outcome.parts:

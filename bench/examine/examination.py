@@ -281,7 +281,6 @@ class _Examination:
                 clock.budget, clock.calls,
             ),
             check=checked,
-            is_quick=stages.is_quick,
             is_complete=stages.is_complete,
             located=stages.located,
             groups=self._group_sizes(),

@@ -36,7 +36,7 @@ class FewSteps:
 
     space: Subspace
     cost: Callable[[np.ndarray], np.ndarray]
-    """The cost by coordinates, ``(m, B)`` to ``(B,)``."""
+    """The cost, ``(d, B)`` to ``(B,)``."""
     gradient: np.ndarray | None
     """The gradient by theta, ``(d,)``."""
     centre: float
@@ -55,7 +55,7 @@ class FewSteps:
         for chosen in np.array_split(np.arange(size), -(-size // max(width // 2, 1))):
             moved = np.zeros((size, 2 * chosen.size))
             moved[np.tile(chosen, 2), np.arange(2 * chosen.size)] = np.r_[-steps[chosen], steps[chosen]]
-            costs = self.cost(moved).reshape(2, -1)
+            costs = self.cost(self.space.place(moved)).reshape(2, -1)
             for index, minus, plus in zip(chosen, *costs, strict=True):
                 self.values[int(index)].append((float(steps[index]), float(minus), float(plus)))
         self.rounds += 1

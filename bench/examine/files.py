@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 
 from bench.examine.findings import Findings
-from bench.examine.smoothing import TARGET_ERROR
 from bench.experiment.columns import Column
 from bench.experiment.views import Chart, Mark
 from bench.report.draw import draw
@@ -38,7 +37,7 @@ def write(report: Findings, directory: Path) -> list[Path]:
 
 
 def charts(report: Findings) -> list[Chart]:
-    """Return the charts for which the report has data: steps, lines and sigmas."""
+    """Return the charts for which the report has data: steps and lines."""
     found = []
     if report.check.parts and report.gradient:
         parts = sorted(report.check.parts, key=lambda part: -np.nan_to_num(part.error, nan=np.inf))[:SHOWN]
@@ -62,14 +61,4 @@ def charts(report: Findings) -> list[Chart]:
         ]
         found.append(Chart("lines", lines, [Column("t", label="t, in sigma")], [Column("cost")], panel="line", marks=marks,
                            title="The cost on lines through theta"))  # fmt: skip
-    if len(known := [one for one in report.smoothed if one.known]) > 1:
-        sigmas = pd.DataFrame([
-            {"sigma": one.sigma, "bias": one.bias / one.norm, "bias_low": one.bias_low / one.norm,
-             "bias_high": one.bias_high / one.norm} for one in known
-        ])  # fmt: skip
-        bias = Column(
-            "bias", label="bias of the gradient, relative to |grad J|", low="bias_low", high="bias_high", log=True
-        )
-        found.append(Chart("sigmas", sigmas, [Column("sigma", label="sigma, noise on theta", log=True)], [bias],
-                           marks=[Mark("10%", TARGET_ERROR, axis="y")], title="Bias under noise on theta"))  # fmt: skip
     return found

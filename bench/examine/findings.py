@@ -176,8 +176,6 @@ class Findings:
     spent: Spent
     check: Check
     """The gradient check; without parts if it did not finish within the budget."""
-    is_quick: bool
-    """Whether the check has at most three steps per component."""
     is_complete: bool
     """Whether every chosen component and group was checked."""
     located: dict[str, tuple[int, int]]

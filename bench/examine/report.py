@@ -37,7 +37,7 @@ class Report(Findings):
         return f"<p><b>{escape(self.name)}: {escape(self.conclusion)}</b></p><pre>{escape(str(self))}</pre>"
 
     def plot(self, chart: str = "") -> Figure:
-        """Return a chart of the page: ``steps``, ``lines`` or ``sigmas``, by default the first for which there is data.
+        """Return a chart of the page: ``steps`` or ``lines``, by default the first for which there is data.
 
         Raises :class:`bench.UserError` for a chart without data.
         """

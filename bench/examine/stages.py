@@ -220,8 +220,7 @@ class GradientStages:
 
     def _compare_quickly(self, space: Subspace) -> None:
         """Compare the gradient with two costs per coordinate, and with more where the full steps do not fit."""
-        cost, unit = partial(self._costs_in, space, None), self.simulator.unit
-        quick = FewSteps(space, cost, self.gradient, self.value, unit, self.repeats.spread)
+        quick = FewSteps(space, self.costs, self.gradient, self.value, self.simulator.unit, self.repeats.spread)
         try:
             for _ in ROUNDS:
                 quick.run_round(self.simulator.width)
@@ -388,9 +387,8 @@ class GradientStages:
         Its error is a small part of the slope of its group, which may be within the tolerance.
         """
         assert self.gradient is not None
-        space, unit = Subspace(self.layout, self.scale, [index], []), self.simulator.unit
-        cost = partial(space.costs, self.costs, width=self.simulator.width)
-        quick = FewSteps(space, cost, self.gradient, self.value, unit, self.repeats.spread)
+        space = Subspace(self.layout, self.scale, [index], [])
+        quick = FewSteps(space, self.costs, self.gradient, self.value, self.simulator.unit, self.repeats.spread)
         for _ in ROUNDS:
             quick.run_round()
         outcome = quick.check()

@@ -140,7 +140,7 @@ class Watch:
         space = Subspace(layout, scale, [], [Group(f"direction {i}", 0, at.size, v) for i, v in enumerate(vectors)])
         value, again = (float(costs(at[:, None])[0]) for _ in range(2))
         noise = abs(again - value)
-        few = FewSteps(space, lambda z: costs(space.place(z)), slopes, value, simulator.unit, noise)
+        few = FewSteps(space, costs, slopes, value, simulator.unit, noise)
         for _ in ROUNDS:
             few.run_round(simulator.width)
         checked = few.check()

@@ -335,7 +335,7 @@ def test_alarm_of_someone_else_is_left_alone():
 def test_files_are_text_tables_and_charts(tmp_path):
     report = examine(bowl, [1.0, 0.5], grad=slope, sigma=[0.003, 0.1])
     names = {path.name for path in report.save(tmp_path / "out")}
-    assert {"report.txt", "derivatives.csv", "sigmas.csv", "steps.png", "lines.png", "sigmas.png"} <= names
+    assert {"report.txt", "derivatives.csv", "sigmas.csv", "steps.png", "lines.png"} <= names
     assert (tmp_path / "out" / "report.txt").read_text() == f"{report}\n"
 
 
