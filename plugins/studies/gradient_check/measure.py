@@ -7,6 +7,7 @@ import math
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -125,14 +126,7 @@ def component_columns(parts: Sequence[gradcheck.Part]) -> dict[str, list[Any]]:
 def check_columns(points: Sequence[Point]) -> dict[str, list[Any]]:
     """Return the columns with a value per check, or per check and step of the differences."""
     return {
-        "point": [point.place.point for point in points],
-        "sample": [point.place.noise for point in points],
-        "direction": [point.place.number for point in points],
-        "contact_switch": [point.place.switch for point in points],
-        "derivative_program": [point.sample.derivative for point in points],
-        "check_verdict": [point.verdict for point in points],
-        "check_error": [point.error for point in points],
-        "check_eps": [point.eps for point in points],
+        **{name: [attrgetter(path)(point) for point in points] for name, path in PER_CHECK.items()},
         "eps": gradcheck.EPS.tolist(),
         "derivative_differences": np.concatenate([point.sample.differences for point in points]).tolist(),
         "relative_error": np.concatenate([point.sample.errors for point in points]).tolist(),
@@ -179,6 +173,11 @@ def under_noise(
     return (jump, math.nan), events
 
 
+PER_CHECK = {
+    "point": "place.point", "sample": "place.noise", "direction": "place.number", "contact_switch": "place.switch",
+    "derivative_program": "sample.derivative", "check_verdict": "verdict", "check_error": "error", "check_eps": "eps",
+}  # fmt: skip
+"""What is stored of each check, by column: an attribute of its :class:`Point`."""
 PER_COMPONENT = ("program", "difference", "uncertainty", "step", "ratio", "left", "right", "verdict")
 """What is stored of each checked component."""
 PLAIN = ("smooth", "nonlinear", "zero", "mode_crossing")
