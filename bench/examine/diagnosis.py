@@ -112,9 +112,7 @@ def refined_gaps(stages: GradientStages, other: Simulator) -> list[Gap]:
         theta = stages.theta + spread * scale * random.standard_normal(size)
         vectors = random.standard_normal((size, min(ALONG, size)))
         vectors *= scale[:, None] / np.linalg.norm(vectors, axis=0)
-        at = np.concatenate([theta[:, None] + eps * vectors, theta[:, None] - eps * vectors], axis=1)
-        w = stages.same_noise(at.shape[1])
-        own, exact = (np.subtract(*np.split(costs, 2)) / (2 * eps) for costs in (stages.costs(at), other.costs(at, w)))
+        own, exact = (stages.differences(theta, vectors, eps, one) for one in (stages.simulator, other))
         slopes = stages.gradient_at(theta) @ vectors
         gaps.append(Gap(*(float(np.linalg.norm(values)) for values in (slopes - exact, own - exact, exact))))
     return gaps
@@ -183,13 +181,11 @@ def smooth_parts(stages: GradientStages, outcome: Check) -> dict[int, SmoothPart
 
 def refined_slopes(stages: GradientStages, other: Simulator, parts: Iterable[Part]) -> dict[int, float]:
     """Return by component of some parts the central difference of the refined cost."""
-    found = {}
-    for index in (part.component for part in parts if part.component is not None):
-        step = float(np.cbrt(stages.simulator.unit)) * stages.scale[index] * REFINED
-        moved = stages.theta[:, None] + np.outer(np.eye(1, stages.theta.size, index)[0], [-step, step])
-        minus, plus = other.costs(moved, stages.same_noise(2))
-        found[index] = float(plus - minus) / (2.0 * step)
-    return found
+    index = [part.component for part in parts if part.component is not None]
+    vectors, scale = np.zeros((stages.theta.size, len(index))), stages.scale[index]
+    vectors[index, np.arange(len(index))] = scale
+    step = float(np.cbrt(stages.simulator.unit)) * REFINED
+    return dict(zip(index, stages.differences(stages.theta, vectors, step, other) / scale, strict=True))
 
 
 @np.errstate(all="ignore")
@@ -288,8 +284,8 @@ def is_adaptive(
     rows = []
     for line in lines:
         step = 1e-3 * float(line.at[1] - line.at[0])
-        costs = stages.costs_along(line.direction, np.array([-step, step]))
-        apart = abs(float((costs[1] - costs[0]) / (2 * step) - line.direction @ stages.gradient))
+        slope = stages.differences(stages.theta, line.direction[:, None], step)
+        apart = abs(float(slope[0] - line.direction @ stages.gradient))
         rows.append((sum(jump.size for jump in line.jumps), np.abs(np.diff(line.costs)).sum(), apart * np.ptp(line.at)))
     heights, changes, errors = np.array(rows).T
     is_near = error <= NEAR and ((heights < SMALL_JUMPS * changes) & (errors <= EXPLAINED * heights)).any()

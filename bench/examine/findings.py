@@ -20,6 +20,7 @@ from bench.examine.stages import Repeats, recaused
 from bench.examine.subspace import MOST
 from bench.gradient import FAULTS, TRUSTED, Check, Part, Sample, rules
 from bench.gradient.direction import CHANCE, resolution
+from bench.gradient.roughness import FINE
 from bench.gradient.rules import EXCUSABLE, RULES, STATUS, SUSPICIOUS, UNEQUAL
 from bench.gradient.smooth_part import LIMIT
 from bench.report.text import counted, number, span
@@ -52,6 +53,8 @@ RESIDUE = 1e-4
 """Largest change of the cost by a gradient, relative to the height of a jump, that is a residue of a solver."""
 SHOWN = 8
 """Most numbers of theta in the table of breaks."""
+ROUGH = 0.1
+"""Share of the cost's change over the widest step that noise between neighbouring thetas makes up where a cost is rough."""
 HEADLINE = 200
 """Most characters of an exception in a headline."""
 RIGHT, WRONG, UNSHOWN, BROKEN, NONE = "right", "wrong", "not shown", "undefined", "none given"
@@ -119,6 +122,10 @@ class Setup:
     """Whether each input may have no effect; None: such inputs cause a warning."""
     seed: int
     horizons: tuple[int, ...]
+
+    def tolerated(self, index: Any, slopes: Any) -> Any:
+        """Return the largest errors of slopes by inputs that only cause a warning."""
+        return self.atol[index] + self.rtol[index] * np.abs(slopes)
 
     @property
     def sigmas(self) -> list[float]:
@@ -239,9 +246,22 @@ class Findings:
     @cached_property
     def judged(self) -> Check:
         """The check with derivatives of a rough cost judged by its smooth part."""
-        if not self.explained.smooth_parts or self.tread or self.check.cause == "rough":
+        if not self.explained.smooth_parts or self.tread or self._is_rough:
             return self.check
         return recaused(self.check, self._of_smooth_part)
+
+    @cached_property
+    def _is_rough(self) -> bool:
+        """Whether an unsettled cost varies as much between neighbours as over a wide step, and the gradient does not say so.
+
+        In chaos it does, and is not blamed.
+        """
+        samples = [p.sample for one in [self.check, *self.more] if one.cause == "unsettled" for p in one.parts]
+        return any(
+            one.noise > ROUGH * np.abs(one.plus - one.minus)[one.finite].max(initial=0.0)
+            and one.noise > max(1e6 * one.unit * abs(one.centre), abs(one.derivative) * FINE * one.scale)
+            for one in samples
+        )
 
     def _of_smooth_part(self, part: Part) -> Part:
         """Return a part of a rough cost with the verdict that wide steps, or a refined cost, give.
@@ -281,11 +301,8 @@ class Findings:
     @cached_property
     def _tolerated(self) -> float:
         """Largest error of a slope along a random direction of components and groups that are all within their tolerance."""
-        setup, parts = self.setup, self.check.components
-        index = [part.component or 0 for part in parts]
-        differences = np.abs([part.difference for part in parts])
-        allowed = setup.atol[index] + setup.rtol[index] * differences
-        sizes = [part.sample.scale * one for part, one in zip(parts, allowed.tolist(), strict=True)]
+        parts = self.check.components
+        sizes = [part.sample.scale * float(self.setup.tolerated(part.component, part.difference)) for part in parts]
         sizes += [group.allowed for group in self.groups.values()]
         return GroupSize(max(len(sizes), 1), float(np.linalg.norm(np.nan_to_num(sizes))), 0.0).tolerated
 
@@ -293,11 +310,11 @@ class Findings:
         """Return whether a wrong part's error is within the tolerance."""
         if part.verdict not in UNEQUAL:
             return False
-        rtol, size, group = self.setup.rtol, abs(part.difference), self.groups.get(part.name)
+        group = self.groups.get(part.name)
         if part.component is not None:
-            allowed = self.setup.atol[part.component] + rtol[part.component] * size
+            allowed = self.setup.tolerated(part.component, part.difference)
         else:
-            allowed = group.tolerated if group else max(self._tolerated, rtol.max() * size)
+            allowed = group.tolerated if group else max(self._tolerated, self.setup.rtol.max() * abs(part.difference))
         return bool(abs(part.program - part.difference) <= allowed)
 
     @property
@@ -375,44 +392,58 @@ class Findings:
 
     def _verdicts(self) -> Iterator[tuple[str, bool, str]]:
         """Yield each verdict about the derivative at theta, whether it holds, and its facts: the first that holds decides."""
-        check, explained, repeats, growth = self.settled, self.explained, self.repeats, self.explained.growth
-        allowed, tolerance = self.setup.allow_zero, max(float(self.setup.rtol.max()), 1e-3)
-        failed = self.wrong_checks[0].cause if self.wrong_checks else ""
-        is_grown, scope = grows(growth, tolerance), self.n_checked
+        repeats = self.repeats
         yield "nondeterministic", repeats.is_failing, "equal calls raise an exception or return a number"
         yield "raised", bool(self.error), shortened(self.error)
-        yield "undecided", not check.parts, scope
+        yield "undecided", not self.check.parts, self.n_checked
         yield "nondeterministic", repeats.is_large, self.spread_text
-        if failed:
-            numbers = self.place if failed == "nonfinite" else self._failed_numbers
-            is_of_a_draw = self.is_random and failed in OF_A_DRAW and not self._is_of_draws
-            yield self._cause_of_mean, is_of_a_draw, self.mean_text
-            yield "staircase", failed in SUSPICIOUS and (self._is_residue or self.has_steps), numbers
-            yield "adaptive", failed == "unsettled" and bool(explained.smooth_parts), numbers
-            is_gap = failed in EXCUSABLE and not explained.refined and self.is_discretisation_gap
-            loop = f", {explained.steps} has another length at other thetas" * bool(explained.steps)
-            yield "adaptive", is_gap, f"{numbers}{loop}"
-            yield "overwritten", is_grown and failed in (*UNEQUAL, "unsettled"), numbers
-            is_falling = self.hint is not None and self.hint.cause == "continuous_adjoint"
-            yield "continuous_adjoint", is_falling and failed in SUSPICIOUS, numbers
-            # so small an error that adaptive steps may explain it, and the budget ended before that was known
-            is_open = explained.is_adaptive is None and not explained.gaps and may_be_adaptive(self.check)
-            yield "undecided", is_open and failed in SUSPICIOUS, f"{numbers}: adaptive steps may explain it"
-            yield "unresolved", failed in SUSPICIOUS and self._is_slight, numbers
-            yield failed, True, numbers
-        yield "undecided", not check.components or not self.is_complete, scope
+        if self.wrong_checks:
+            yield from self._verdicts_on_failed(self.wrong_checks[0].cause)
+        yield from self._verdicts_on_passed()
+
+    def _verdicts_on_failed(self, failed: str) -> Iterator[tuple[str, bool, str]]:
+        """Yield the verdicts on a check that failed with a cause, the cause itself last."""
+        explained, numbers = self.explained, self.place if failed == "nonfinite" else self._failed_numbers
+        is_of_a_draw = self.is_random and failed in OF_A_DRAW and not self._is_of_draws
+        is_suspicious = failed in SUSPICIOUS
+        yield self._cause_of_mean, is_of_a_draw, self.mean_text
+        yield "staircase", is_suspicious and (self._is_residue or self.has_steps), numbers
+        yield "rough", failed == "unsettled" and self._is_rough, ""
+        yield "adaptive", failed == "unsettled" and bool(explained.smooth_parts), numbers
+        is_gap = failed in EXCUSABLE and not explained.refined and self.is_discretisation_gap
+        loop = f", {explained.steps} has another length at other thetas" * bool(explained.steps)
+        yield "adaptive", is_gap, f"{numbers}{loop}"
+        is_grown = grows(explained.growth, self._tolerance_of_horizons)
+        yield "overwritten", is_grown and failed in (*UNEQUAL, "unsettled"), numbers
+        is_falling = self.hint is not None and self.hint.cause == "continuous_adjoint"
+        yield "continuous_adjoint", is_falling and is_suspicious, numbers
+        # so small an error that adaptive steps may explain it, and the budget ended before that was known
+        is_open = explained.is_adaptive is None and not explained.gaps and may_be_adaptive(self.check)
+        yield "undecided", is_open and is_suspicious, f"{numbers}: adaptive steps may explain it"
+        yield "unresolved", is_suspicious and self._is_slight, numbers
+        yield failed, True, numbers
+
+    def _verdicts_on_passed(self) -> Iterator[tuple[str, bool, str]]:
+        """Yield the verdicts where no check failed, that of the right derivative last."""
+        check, growth, tolerance = self.settled, self.explained.growth, self._tolerance_of_horizons
+        yield "undecided", not check.components or not self.is_complete, self.n_checked
         # no larger step is left than that with the best central difference
         yield "nonfinite", bool(self.failures) and self.failures[0][0] <= self.unit ** (1 / 3), self.place
         yield "unresolved", bool(self.gradient and self.unresolved), "".join(map(self.numbers, self.unresolved[:1]))
         late = max(growth, key=lambda one: one.error, default=None)
         is_late = any(one.is_wrong(tolerance) for one in growth)
         text = f"after {late.steps} steps off by {number(100 * late.error)}%" if late else ""
-        yield "overwritten" if is_grown else "missing_term", is_late, text
+        yield "overwritten" if grows(growth, tolerance) else "missing_term", is_late, text
+        allowed = self.setup.allow_zero
         is_still = not self.moves_around
         is_zero = all(part.verdict == "zero" for part in check.parts)
         yield "constant", is_still and is_zero and (allowed is None or not allowed.all()), ""
         yield "no_effect", is_still and allowed is not None and bool(self.zeros), ", ".join(self.zeros[:SHOWN])
         yield "saturated" if check.cause == "zero" else check.cause, True, ""
+
+    @property
+    def _tolerance_of_horizons(self) -> float:
+        return max(float(self.setup.rtol.max()), 1e-3)
 
     @cached_property
     def _verdict(self) -> tuple[str, str]:

@@ -18,9 +18,8 @@ import numpy as np
 
 from bench.examine.few import ROUNDS, FewSteps, is_nothing
 from bench.examine.subspace import Group, Subspace, choose, count_of, locate
-from bench.gradient import EPS, FAULTS, TRUSTED, Check, Options, Part, Sample, check, step_sizes
+from bench.gradient import EPS, FAULTS, TRUSTED, Check, Options, Part, check, step_sizes
 from bench.gradient.check import ELSEWHERE, NOTHING, cause_of
-from bench.gradient.roughness import FINE
 from bench.simulator.clock import OutOfTime
 from bench.simulator.simulator import Simulator
 
@@ -36,8 +35,6 @@ MANY = 10_000
 """Largest theta that is checked at 8 other thetas; a larger one at 2, since each call copies all its numbers."""
 OTHER_NOISE = 2
 """Number of further draws of the simulator's own noise under which the gradient is checked along random directions."""
-ROUGH = 0.1
-"""Share of the cost's change over the widest step that noise between neighbouring thetas makes up where a cost is rough."""
 IN_CELL = 0.4
 """Distance from a float32 number, in units of its last place, that float32 rounds away."""
 CELLS, DISTINCT_CELLS = 9, 6
@@ -133,6 +130,14 @@ class GradientStages:
     def costs_along(self, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Return the costs ``(n,)`` at theta + t * direction for t of n numbers."""
         return np.concatenate([self.costs(thetas) for thetas in self.thetas_along(direction, t.ravel())])
+
+    def differences(
+        self, theta: np.ndarray, vectors: np.ndarray, step: float, simulator: Simulator | None = None
+    ) -> np.ndarray:
+        """Return central differences ``(m,)`` at ``theta (d,)`` along ``vectors (d, m)``, of the cost or of another simulator."""
+        thetas = theta[:, None] + step * np.concatenate([vectors, -vectors], axis=1)
+        costs = (simulator or self.simulator).costs(thetas, self.same_noise(thetas.shape[1]))
+        return np.asarray(np.subtract(*np.split(costs, 2)) / (2.0 * step))
 
     def gradient_at(self, theta: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
         """Return the simulator's gradient at ``theta (d,)``."""
@@ -366,7 +371,7 @@ class GradientStages:
         outcome = _with_zeros(outcome)
         if outcome.cause == "nondeterministic" and not is_own and not self.repeats.is_large:
             outcome = recaused(outcome)  # only the last digits of the gradient differ
-        return _with_roughness(outcome)
+        return outcome
 
     def _locate(self, space: Subspace) -> None:
         """Find the numbers that cause the error of each wrong group."""
@@ -420,22 +425,6 @@ def _with_zeros(outcome: Check) -> Check:
     if all(part.verdict == "zero" for part in zeros):
         return outcome
     return recaused(outcome, lambda part: replace(part, verdict="zero") if any(part is p for p in zeros) else part)
-
-
-def _with_roughness(outcome: Check) -> Check:
-    """Return a check with the cause ``rough`` where the cost varies as much between neighbours as over a wide step.
-
-    Where the gradient itself says that neighbours differ by as much, as in chaos, it is not blamed.
-    """
-    samples = [part.sample for part in outcome.parts if outcome.cause == "unsettled"]
-    is_blamed = any(is_rough(one) and abs(one.derivative) * FINE * one.scale < one.noise for one in samples)
-    return replace(outcome, cause="rough") if is_blamed else outcome
-
-
-def is_rough(sample: Sample) -> bool:
-    """Return whether the cost varies as much between neighbouring thetas as over a wide step."""
-    change = np.abs(sample.plus - sample.minus)[sample.finite].max(initial=0.0)
-    return bool(sample.noise > ROUGH * change and sample.noise > 1e6 * sample.unit * abs(sample.centre))
 
 
 def recaused(outcome: Check, replaced: Callable[[Part], Part] = lambda part: part) -> Check:

@@ -7,6 +7,7 @@ loops all have fixed lengths has no such excuse.
 from __future__ import annotations
 
 import ast
+import itertools
 import linecache
 import sys
 from collections import Counter
@@ -28,7 +29,7 @@ SKIPPED = tuple(
 def changing_loop(simulator: Simulator, thetas: np.ndarray, w: np.ndarray | None) -> str:
     """Return a while loop whose length depends on theta, as ``the loop at ode.py:17``; empty where none is known.
 
-    A JAX program is read: a loop whose condition depends on theta. Other Python code runs under a trace at
+    A JAX program is read: a loop that does not count to a number. Other Python code runs under a trace at
     ``thetas (d, n)``. Loops of compiled code are not seen.
     """
     place = _loop_of_jax(simulator, thetas[:, 0], w)
@@ -79,7 +80,7 @@ def _while_loops(file: str) -> set[int]:
 
 
 def _loop_of_jax(simulator: Simulator, theta: np.ndarray, w: np.ndarray | None) -> str:
-    """Return ``a while loop`` for a JAX program with a while loop whose condition depends on theta; empty without one."""
+    """Return ``a while loop`` for a JAX program with one that does not count; empty without one."""
     if "jax" not in sys.modules:
         return ""
     import jax
@@ -89,41 +90,20 @@ def _loop_of_jax(simulator: Simulator, theta: np.ndarray, w: np.ndarray | None) 
         closed = jax.make_jaxpr(lambda vector: simulator.call(vector, *noise))(jax.numpy.asarray(theta))
     except Exception:  # a program that JAX cannot read has no such loop
         return ""
-    places: list[str] = []
-    _depends(closed.jaxpr, [True] * len(closed.jaxpr.invars), places)
-    return places[0] if places else ""
+    return "a while loop" * _has_open_loop(closed.jaxpr)
 
 
-def _depends(jaxpr: Any, given: list[bool], places: list[str]) -> list[bool]:
-    """Return which outputs of a JAX program depend on inputs that do, and append the places of while loops that do."""
-    known = {id(variable): one for variable, one in zip(jaxpr.invars, given, strict=True)}
-
-    def reads(variables: Any) -> list[bool]:
-        return [known.get(id(variable), False) for variable in variables]
-
-    for equation in jaxpr.eqns:
-        inputs, inner = reads(equation.invars), _programs(equation)
-        outputs = [any(inputs)] * len(equation.outvars)
+def _has_open_loop(program: Any) -> bool:
+    """Return whether a program of JAX has a while loop whose condition reads more than integers, as ``fori_loop`` does."""
+    for equation in program.eqns:
         if equation.primitive.name == "while":
-            first, second = equation.params["cond_nconsts"], equation.params["body_nconsts"]
-            carried = inputs[first + second :]
-            for _ in range(len(carried) + 1):
-                after = _depends(equation.params["body_jaxpr"].jaxpr, inputs[first : first + second] + carried, [])
-                carried = [a or b for a, b in zip(carried, after, strict=True)]
-            if any(_depends(equation.params["cond_jaxpr"].jaxpr, inputs[:first] + carried, [])):
-                places.append("a while loop")
-            _depends(equation.params["body_jaxpr"].jaxpr, inputs[first : first + second] + carried, places)
-            outputs = carried
-        elif any(inputs):
-            for program in inner:
-                _depends(program, _fitted(inputs, len(program.invars)), places)
-        known |= {id(variable): one for variable, one in zip(equation.outvars, outputs, strict=True)}
-    return reads(jaxpr.outvars)
-
-
-def _fitted(inputs: list[bool], count: int) -> list[bool]:
-    """Return the inputs of an inner program: the last of the equation's, or all of them where their number differs."""
-    return inputs[-count:] if len(inputs) >= count else [True] * count
+            condition = equation.params["cond_jaxpr"].jaxpr
+            read = {id(v) for v in itertools.chain(condition.outvars, *(one.invars for one in condition.eqns))}
+            if any(id(v) in read and v.aval.dtype.kind not in "iu" for v in condition.invars):
+                return True
+        if any(map(_has_open_loop, _programs(equation))):
+            return True
+    return False
 
 
 def _programs(equation: Any) -> list[Any]:

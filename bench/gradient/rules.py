@@ -143,7 +143,7 @@ EXAMINATION = {
     ),
     "rough": Rule(
         "fault", "the cost changes as much between neighbouring thetas as over a wide step",
-        "`unsettled`, and neighbours by {stages.ROUGH:.0%} of the largest change, which the gradient does not explain",
+        "`unsettled`, and neighbours by {findings.ROUGH:.0%} of the largest change, which the gradient does not explain",
         "look for a seed or hash taken from theta",
     ),
     "overwritten": Rule(

@@ -308,3 +308,25 @@ def test_a_loop_without_a_condition_has_a_length_too():
     )
     fixed = Simulator(swing, ParameterTree(START))
     assert changing_loop(fixed, np.outer(START, [0.2, 0.6]), None) == ""
+
+
+def test_a_while_loop_of_jax_that_counts_has_a_fixed_length():
+    jax = pytest.importorskip("jax")
+    loop = jax.lax
+
+    def counted(x):
+        return jax.jit(lambda y: loop.fori_loop(0, 5, lambda i, z: 0.5 * z, y))(x[0])
+
+    def adaptive(x):
+        return loop.while_loop(lambda z: z[0] > 0.1, lambda z: (0.5 * z[0], z[1] + 1), (x[0], 0))[0]
+
+    def inside(x):
+        return loop.scan(lambda c, _: (adaptive([c]), None), x[0], None, length=2)[0]
+
+    def flagged(x):
+        """Return the same with the condition in the state, as equinox has it."""
+        return loop.while_loop(lambda z: z[1], lambda z: (0.5 * z[0], z[0] > 0.1), (x[0], True))[0]
+
+    thetas = np.array([[1.0, 2.0]])
+    for cost, found in ((counted, ""), (adaptive, "a while loop"), (inside, "a while loop"), (flagged, "a while loop")):
+        assert changing_loop(Simulator(cost, ParameterTree([1.0]), "jax"), thetas, None) == found, cost

@@ -7,6 +7,7 @@ import math
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,29 +59,38 @@ class Point:
     plus: Sequence[str]
     """Contact modes on the plus side."""
 
+    @property
+    def error(self) -> float:
+        """Smallest relative error over all steps."""
+        return float(self.sample.errors[gradcheck.best(self.sample)])
+
+    @property
+    def eps(self) -> float:
+        """Step of the smallest error, in units of the scale of theta."""
+        return float(gradcheck.EPS[gradcheck.best(self.sample)])
+
 
 def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, Any]:
     """Return one cell's results by column, except ``command``, from checks at theta0 and around contact switches."""
     problem = session.problem(cell)
-    theta = problem.program.theta0
-    unit = float(np.finfo(cell.backend.dtype).eps)
+    theta, unit = problem.program.theta0, float(np.finfo(cell.backend.dtype).eps)
     drawn = noise.draw(cell.seed, cell.scene.name, 1, 1, problem.program.n_noise, "gradient check")[0, 0]
     directions = noise.draw(cell.seed, cell.scene.name, 1, search.drawn, theta.size, "directions")[0]
     whole = start(problem, theta, unit, search, cell.seed)
-    along = directions[0] / np.linalg.norm(directions[0])
     sampled = sampled_gradients(problem, theta, cell.seed, COLUMNS_AT_ONCE)
     (jump, distance), events = under_noise(problem, theta, sampled, cell.seed)
+    along = directions[0] / np.linalg.norm(directions[0])
     reached = [Place("noise", 0, 1, theta, along, event.w, verdict=event.verdict) for event in events]
     found = examine(problem, drawn, directions, unit, search, reached)
     points = [*at_start(whole), *(_settled(problem, point) for point in found)]
-    lost = all(point.verdict == "nonfinite" for point in points)
+    is_lost = all(point.verdict == "nonfinite" for point in points)
     remarks = [SURROGATE] if problem.program.surrogate else []
     remarks += [] if whole.cause in PLAIN else [whole.sentence()]
-    remarks += [event.remark for event in events]
+    remarks += [*(event.remark for event in events), *beyond_stability(cell)]
     return {
-        "status": "nonfinite" if lost else "ok",
-        "reason": "no cost is finite" if lost else "; ".join([*remarks, *beyond_stability(cell)]),
-        **_checks(points, sampled.spread / math.sqrt(cell.samples)),
+        "status": "nonfinite" if is_lost else "ok",
+        "reason": "no cost is finite" if is_lost else "; ".join(remarks),
+        **verdict_columns(points, sampled.spread / math.sqrt(cell.samples)),
         "scale": scale_of(theta),
         "taylor_order": whole.order,
         "jump": jump.height,
@@ -88,33 +98,35 @@ def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, An
         "jump_distance": distance,
         "cost_noise": whole.noise,
         "device": problem.device,
-        "component": [part.component for part in whole.components],
-        **{f"component_{name}": [getattr(part, name) for part in whole.components] for name in PER_COMPONENT},
+        **component_columns(whole.components),
+        **check_columns(points),
     }
 
 
-def _checks(points: list[Point], spread: float) -> dict[str, Any]:
-    """Return the columns of the checked points, and the verdict of all, for samples of that relative ``spread``."""
-    best = [gradcheck.best(point.sample) for point in points]
-    errors = [float(point.sample.errors[k]) for point, k in zip(points, best, strict=True)]
-    steps = [float(gradcheck.EPS[k]) for k in best]
-    severest = min(range(len(points)), key=lambda i: (gradcheck.VERDICTS.index(points[i].verdict), -errors[i]))
+def verdict_columns(points: Sequence[Point], spread: float) -> dict[str, Any]:
+    """Return the columns of the worst check, and whether the gradient can be trusted where estimates have a ``spread``."""
+    worst = min(points, key=lambda point: (gradcheck.VERDICTS.index(point.verdict), -point.error))
     untrusted = sum(not is_trusted(point.place.point, point.verdict) for point in points)
     return {
-        "verdict": points[severest].verdict,
+        "verdict": worst.verdict,
+        "best_error": worst.error,
+        "best_eps": worst.eps,
         "untrusted": untrusted,
         "spread": spread,
         "trusted": "no" if untrusted or not spread < SPREAD else "yes",
-        "best_error": errors[severest],
-        "best_eps": steps[severest],
-        "point": [point.place.point for point in points],
-        "sample": [point.place.noise for point in points],
-        "direction": [point.place.number for point in points],
-        "contact_switch": [point.place.switch for point in points],
-        "derivative_program": [point.sample.derivative for point in points],
-        "check_verdict": [point.verdict for point in points],
-        "check_error": errors,
-        "check_eps": steps,
+    }
+
+
+def component_columns(parts: Sequence[gradcheck.Part]) -> dict[str, list[Any]]:
+    """Return the columns with a value per checked component."""
+    columns = {f"component_{name}": [getattr(part, name) for part in parts] for name in PER_COMPONENT}
+    return {"component": [part.component for part in parts], **columns}
+
+
+def check_columns(points: Sequence[Point]) -> dict[str, list[Any]]:
+    """Return the columns with a value per check, or per check and step of the differences."""
+    return {
+        **{name: [attrgetter(path)(point) for point in points] for name, path in PER_CHECK.items()},
         "eps": gradcheck.EPS.tolist(),
         "derivative_differences": np.concatenate([point.sample.differences for point in points]).tolist(),
         "relative_error": np.concatenate([point.sample.errors for point in points]).tolist(),
@@ -161,6 +173,11 @@ def under_noise(
     return (jump, math.nan), events
 
 
+PER_CHECK = {
+    "point": "place.point", "sample": "place.noise", "direction": "place.number", "contact_switch": "place.switch",
+    "derivative_program": "sample.derivative", "check_verdict": "verdict", "check_error": "error", "check_eps": "eps",
+}  # fmt: skip
+"""What is stored of each check, by column: an attribute of its :class:`Point`."""
 PER_COMPONENT = ("program", "difference", "uncertainty", "step", "ratio", "left", "right", "verdict")
 """What is stored of each checked component."""
 PLAIN = ("smooth", "nonlinear", "zero", "mode_crossing")
