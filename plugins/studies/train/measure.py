@@ -80,15 +80,23 @@ def measure(cell: Cell, session: Session, settings: Train) -> dict[str, Any]:
     return {
         "status": "ok" if bad is None else "nonfinite",
         "reason": "" if bad is None else f"{bad[1]} is not finite at update {bad[0]}",
-        "first_return": table[0, 3], "final_return": final[0], "final_return_low": final[1], "final_return_high": final[2],
-        "final_median": final[3], "updates": int(table[-1, 0]), "steps": int(table[-1, 1]), "train_s": spent,
-        "compile_s": compile_s, "gradient_typical": float(np.nanmedian(norms)), "gradient_peak": float(np.nanmax(norms)),
+        "first_return": table[0, 3],
+        "final_return": final[0],
+        "final_return_low": final[1],
+        "final_return_high": final[2],
+        "final_median": final[3],
+        "updates": int(table[-1, 0]),
+        "steps": int(table[-1, 1]),
+        "train_s": spent,
+        "compile_s": compile_s,
+        "gradient_typical": float(np.nanmedian(norms)),
+        "gradient_peak": float(np.nanmax(norms)),
         "gradient_zero": float((norms == 0).mean()),
         **probe,
         **{f"curve_{name}": table[:, i].tolist() for i, name in enumerate(CURVE)},
         **{name: [row[i] for row in cosines] for i, name in enumerate(("cosine_update", "cosine", "cosine_denoised"))},
         **_thinned(log, settings.entries),
-    }  # fmt: skip
+    }
 
 
 def _training(cell: Cell, backend: Any) -> Training:
