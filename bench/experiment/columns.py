@@ -72,6 +72,8 @@ class Column:
     """The value that intervals are compared with: an end that differs from it never prints as it."""
     limit: str = field(default="", kw_only=True)
     """The column that is true where the value is an upper limit."""
+    least: float = field(default=0.0, kw_only=True)
+    """Smaller values are drawn here on a logarithmic axis, as upper limits."""
     log: bool | None = field(default=None, kw_only=True)
     """Whether its axis is logarithmic; None: if all values are positive and span a factor of 8."""
     emphasis: str = field(default="", kw_only=True)

@@ -48,8 +48,8 @@ UNLIMITED = 1e9
 """Factor on a value at which the bar of an interval without an upper end stops, beyond every logarithmic axis."""
 BAND: dict[str, Any] = {"color": "#D55E00", "alpha": 0.12, "linewidth": 0}
 """Look of a named range of an axis."""
-EXACT, USELESS = 1e-4, 1e2
-"""Where a value above 1 means a failure, smaller values are drawn here as upper limits, and larger ones with their number."""
+USELESS = 1e2
+"""Where a value above 1 means a failure, larger values are drawn here with their number."""
 NAME = 0.8
 """Longest line of a name at a point, in inches."""
 BEHIND: dict[str, Any] = {"facecolor": "#ffffff", "alpha": 0.7, "linewidth": 0, "pad": 0.5}
@@ -185,7 +185,9 @@ def _signs(chart: Chart) -> list[str]:
     if not column:
         return []
     is_grey = column.above_one and _is_log(column, chart.frame[column.name]) and _log_range(column, chart.frame)[1] > 1
-    is_hollow = column.limit and (chart.frame[column.limit].eq(True) | (chart.frame[column.name] < EXACT)).any()
+    is_hollow = (column.limit and chart.frame[column.limit].eq(True).any()) or (
+        chart.frame[column.name] < column.least
+    ).any()
     return [f"grey: {column.above_one}"] * bool(is_grey) + ["hollow: an upper limit"] * bool(is_hollow)
 
 
@@ -261,9 +263,8 @@ def _scale_values(chart: Chart, panel: Axes, which: Literal["x", "y"], column: C
 
 def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[Mark] = ()) -> tuple[float, float]:
     """Return the range of a logarithmic axis: all positive values, and their intervals within a factor of 100."""
-    values = rows[column.name].to_numpy(float)
+    values = rows[column.name].clip(column.least, USELESS if column.above_one else None).to_numpy(float)
     values = values[np.isfinite(values) & (values > 0)]
-    values = values.clip(EXACT, USELESS) if column.above_one else values
     if not values.size:
         return 0.1, 10.0
     low, high = float(values.min()), float(values.max())
@@ -346,7 +347,7 @@ def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str
     for _, points in part.groupby(chart.arrow, sort=False):
         ends = points[[chart.x[0].name, chart.y[0].name]].to_numpy(float, copy=True)
         if chart.y[0].above_one:
-            ends[:, 1] = ends[:, 1].clip(EXACT, USELESS)
+            ends[:, 1] = ends[:, 1].clip(chart.y[0].least, USELESS)
         series, places = str(points[chart.series].iloc[0]), (np.log(ends) - low) / (high - low) * size
         if np.ptp(places, axis=0).max() > NEAR:
             look = {"arrowstyle": "-|>", "color": styles[series].colour, "linewidth": 1.6, "shrinkA": 3, "shrinkB": 3}
@@ -383,7 +384,7 @@ def _draw_values(
     limit, lost = (
         points[name].to_numpy(bool) if name else np.zeros(len(points), bool) for name in (column.limit, chart.failed)
     )
-    least, most = (EXACT, USELESS) if log and column.above_one else (0.0, math.inf)
+    least, most = (column.least, USELESS if column.above_one else math.inf) if log else (0.0, math.inf)
     is_zero, is_cut = log & (values <= least), values > most
     given, values = values, np.where(is_zero & (least == 0), np.nan, values.clip(least, most) if log else values)
     limit, is_zero = limit | is_zero, is_zero & (least == 0)
@@ -445,7 +446,7 @@ def _draw_dots(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, 
     log = _is_log(x, values[x.name])
     if chart.join:
         for category, points in part.groupby(part[y.name].astype(str), sort=False):
-            ends = points[x.name].to_numpy(float)
+            ends = points[x.name].clip(x.least).to_numpy(float)
             ends = ends[np.isfinite(ends) & ((ends > 0) | (not log))]
             if len(ends) > 1:
                 shade = styles[str(points[chart.series].iloc[-1])].colour if chart.series else "#000000"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -69,13 +69,6 @@ class Shown:
             self.experiment.study.name, rows, [*heads, *shown, COMMON["status"]], title, notes, terminal=terminal,
             data=axes.table(self.experiment, self.stored),
         )  # fmt: skip
-
-
-def floored(frame: pd.DataFrame, floor: float, names: Iterable[str]) -> pd.DataFrame:
-    """Return a frame whose smaller values are the floor, and true there in the columns ``<name>_limit``."""
-    names = list(names)
-    limits = {f"{name}_limit": frame[name] < floor for name in names}
-    return frame.assign(**limits, **{name: frame[name].clip(lower=floor) for name in names})
 
 
 def stacked(frame: pd.DataFrame, series: Mapping[str, str], value: str) -> pd.DataFrame:

@@ -79,17 +79,16 @@ class Solver(StudyPackage):
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
         """Return the table with a line per scene, engine and iterations, and the chart of errors."""
-        from bench.report.shown import Shown, floored
+        from bench.report.shown import Shown
 
         shown = Shown(experiment, rows)
         cells = shown.cells(
             SHOWN, "gradients along the iterations of the constraint solver", NOTES, ("scene", "backend")
         )
         iterations = shown.column("iterations", label="iterations of the solver", log=True)
-        error = shown.column("gradient_error_rel", label="relative error", limit="gradient_error_rel_limit", log=True)
-        # smallest relative error that is drawn; smaller ones, 0 included, are drawn here as upper limits
+        error = shown.column("gradient_error_rel", label="relative error", least=1e-6, log=True)
         chart = Chart(
-            "solver", floored(shown.good, 1e-6, [error.name]), [iterations], [error], series="method", panel="problem",
+            "solver", shown.good, [iterations], [error], series="method", panel="problem",
             marks=[Mark("as large as the gradient", 1.0, axis="y")], subtitle="against the gradient of the program with a converged solver",
         )  # fmt: skip
         return Views([cells], [chart])

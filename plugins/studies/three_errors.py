@@ -208,7 +208,7 @@ def _dumbbells(shown: Shown, trapped: pd.DataFrame) -> Chart:
     import pandas as pd
 
     from bench.report.problems import problem_names
-    from bench.report.shown import floored, stacked
+    from bench.report.shown import stacked
 
     rows = along_steps(shown)
     scene = problem_names(shown.arranged, ["scene"], shown.over or shown.arranged.axes, ["scene"], rows)
@@ -216,12 +216,11 @@ def _dumbbells(shown: Shown, trapped: pd.DataFrame) -> Chart:
     laws = [problem_names(shown.arranged, PARTS[1:], shown.over, ["contact"], own) for _, own in rows.groupby(scene)]
     rows = rows.assign(panel=scene, law=pd.concat(laws)).drop_duplicates(["panel", "law"]).sort_index()
     errors = stacked(rows, {OWN: "program_error_rel", PHYSICS: "model_error_rel"}, "error")
-    # smallest error that is drawn; smaller ones, 0 included, are drawn here as upper limits
-    errors = floored(errors.sort_values("row", kind="stable"), 1e-16, ["error"]).dropna(subset=["error"])
+    errors = errors.sort_values("row", kind="stable").dropna(subset=["error"])
     is_trap = errors["problem"].isin(trapped["problem"]) & (errors["series"] == PHYSICS)
     return Chart(
         "three_errors", errors.assign(series=errors["series"].mask(is_trap, TRAP)).reset_index(drop=True),
-        [Column("error", label="relative error", limit="error_limit", log=True, above_one="larger than the gradient")],
+        [Column("error", label="relative error", least=1e-4, log=True, above_one="larger than the gradient")],
         [text("law", label="")], "dots", series="series", panel="panel", styles=STYLES, join=True, across=2, height=0.2,
         subtitle="At the smallest time step." if shown.over else "",
         text="The longer the line, the better a wrong gradient passes a check against differences of its own cost.",

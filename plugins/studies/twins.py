@@ -104,16 +104,14 @@ class Twins(StudyPackage):
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
         """Return the table with a line per scene and engine, and the chart of differences, the largest first."""
-        from bench.report.shown import Shown, floored
+        from bench.report.shown import Shown
 
         shown = Shown(experiment, rows)
         cells = shown.cells(SHOWN, "engines compared with the scenes' own programs", NOTES)
         worst = shown.good.groupby("problem")["gradient_difference_rel"].transform("max")
-        frame = floored(shown.good.loc[worst.sort_values(ascending=False, kind="stable").index], FLOOR, DIFFERENCES)
-        # relative difference above which a twin's states or gradient count as different. Accumulated rounding is
-        # smaller
+        frame = shown.good.loc[worst.sort_values(ascending=False, kind="stable").index]
         chart = Chart(
-            "twins", frame, [shown.column(name, limit=f"{name}_limit", log=True, label=self.columns.by_name[name].doc) for name in DIFFERENCES],
+            "twins", frame, [shown.column(name, least=FLOOR, log=True, label=self.columns.by_name[name].doc) for name in DIFFERENCES],
             [text("problem", label="")], "dots", series="method", marks=[Mark("rounding up to here", 1e-6)], height=0.3,
             text="One dot per problem and engine. Left of the dashed line a difference is accumulated rounding.",
         )  # fmt: skip

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from bench.plugins.studies.bias_variance import views as tables
-from bench.plugins.studies.bias_variance.charts import RMSE
+from bench.plugins.studies.bias_variance.charts import FLOOR, RMSE
 from bench.plugins.studies.bias_variance.columns import TABLE
 from bench.plugins.studies.bias_variance.comparisons import at_equal_rollouts, lowest, method_table, problems_by_axis
 from bench.plugins.studies.bias_variance.time_to_accuracy import with_gradient_cost
@@ -37,7 +37,7 @@ from bench.experiment.axes import axes
 from bench.experiment.columns import Column, text
 from bench.experiment.views import Chart, Views
 from bench.report import latex, views, writer
-from bench.report.draw import EXACT, NARROW, WIDTH, draw
+from bench.report.draw import NARROW, WIDTH, draw
 from bench.report.figures import DPI, save, styled
 from bench.report.problems import split_by_problem
 
@@ -196,7 +196,7 @@ def test_a_value_of_0_is_hollow_at_the_edge_of_a_logarithmic_axis_and_a_useless_
     hollow = [
         line for line in panel.lines if line.get_markerfacecolor() == "white" and np.isfinite(line.get_ydata()).any()
     ]
-    assert [(list(line.get_xdata()), list(line.get_ydata())) for line in hollow] == [([1.0], [EXACT])]
+    assert [(list(line.get_xdata()), list(line.get_ydata())) for line in hollow] == [([1.0], [FLOOR])]
     assert panel.get_ylim()[1] < 1e3
     assert "1.0e24 ↑" in [text.get_text() for text in panel.texts]
 

@@ -36,17 +36,17 @@ from .time_to_accuracy import COSTS, ROLLOUTS, SAMPLES, TARGETS, TIME, with_know
 from .time_to_accuracy import methods as methods_by_cost
 
 FLOOR = 1e-4
-"""Relative biases below this are drawn here, as upper limits."""
+"""Relative errors below this are drawn here, as upper limits."""
 GRADES = {0.1: "#08519c", 0.3: "#6baed6", 1.0: "#d6e6f4", 10.0: "#fdae61", math.inf: "#c51b1b"}
 """Upper ends of the grades of an error, and their colours."""
 PANELS = 4
 """Most problems of a chart along an axis."""
 RMSE = Column(
-    "rmse_rel", label="relative RMSE of one estimate", low="rmse_low", high="rmse_high", limit="rmse_limit", log=True,
+    "rmse_rel", label="relative RMSE of one estimate", low="rmse_low", high="rmse_high", limit="rmse_limit", log=True, least=FLOOR,
     above_one="worse than the zero estimate",
 )  # fmt: skip
 BIAS = Column(
-    "bias_shown", label="relative bias", low="bias_from", high="bias_to", limit="bias_limit", log=True,
+    "bias_shown", label="relative bias", low="bias_from", high="bias_to", limit="bias_limit", log=True, least=FLOOR,
     above_one="larger than the gradient",
 )  # fmt: skip
 COST = interval("cost", label="cost of a rollout", log=False)
@@ -97,8 +97,8 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
         "rmse_rel": pd.Series(error, rows.index),
         "rmse_low": pd.Series(low, rows.index),
         "rmse_high": pd.Series(high, rows.index),
-        "bias_shown": (rows["bias"].where(~limit, rows["bias_high"]) / norm).clip(lower=FLOOR),
-        "bias_from": (rows["bias_low"] / norm).clip(lower=FLOOR),
+        "bias_shown": rows["bias"].where(~limit, rows["bias_high"]) / norm,
+        "bias_from": rows["bias_low"] / norm,
         "bias_to": rows["bias_high"] / norm,
         ROLLOUTS: rows[ROLLOUTS],
     }
