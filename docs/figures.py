@@ -107,6 +107,34 @@ def rollouts_table() -> str:
     ])  # fmt: skip
 
 
+def overhead_table() -> str:
+    """Return the processor times of backends over those of programs written by hand as a Markdown table."""
+    batches = ("1", "16", "100", "1000", "10000")
+    lines = [
+        "| processor time over that of a program by hand | " + " | ".join(f"{int(n):,}" for n in batches) + " |",
+        "|---" + "|--:" * len(batches) + "|",
+    ]
+    for backend, method, what in (
+        ("jax", "grad", "gradient"),
+        ("torch", "grad", "gradient"),
+        ("numpy", "value", "cost"),
+    ):
+        names = [f"{backend} {method} over by hand, {n} rollouts: processor time" for n in batches]
+        lines.append(f"| `{backend}` {what} | " + " | ".join(number(speeds()[name]) for name in names) + " |")
+    return block(lines)
+
+
+def overhead_agrees() -> str:
+    """Return the largest relative difference between the numbers of a backend and of the program written by hand."""
+    return number(
+        max(
+            value
+            for name, value in speeds().items()
+            if name.endswith("largest relative difference") and "by hand" in name
+        )
+    )
+
+
 def dose(table: str, name: str = "dose_response") -> pd.DataFrame:
     """Return a table of a study of errors as stored."""
     return pd.read_csv(STANDARD / name / f"{table}.csv", keep_default_na=True)
@@ -288,6 +316,8 @@ FIGURES: dict[str, str | Callable[[], str]] = {
     **{f"trust-all-{name}": trust_figure(name, *FOUR) for name in ("cells", "trusted", "wrong")},
     "speed-cell": lambda: number(speeds()["overhead of a cell"]),
     "speed-rollouts": rollouts_table,
+    "speed-overhead": overhead_table,
+    "speed-overhead-agree": overhead_agrees,
     "speed-scenes": lambda: span(
         [value for scene in SCENES for value in speed(f"fused over jax, {scene}, * rollouts")]
     ),

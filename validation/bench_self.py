@@ -48,7 +48,7 @@ BY_HAND = {
 }  # fmt: skip
 """Method and program by hand with which a backend is compared."""
 SMALL_SIZES = (1, 16, 100, 1_000, 10_000)
-LEAST_BLOCK, BLOCKS = 0.02, 15
+LEAST_BLOCK, BLOCKS = 0.02, 31
 """Least processor time of a block of equal calls [s], since its clock is coarse across threads, and the number of pairs of blocks."""
 NATIVE_COLUMNS = 1024
 SMALL = ("scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg]", "samples=16", "repeats=4")
@@ -218,15 +218,16 @@ PARTS = {
 
 def main(words):
     """Measure, print and write the speeds."""
-    folder, parts = Path(*words[:1] or ["results/bench_self"]), words[1:] or list(PARTS)
+    folder, parts = Path(*words[:1] or ["results/bench_self"]), words[1:]
     path = folder / "bench_self.json"
-    lines = {line["what"]: line for line in json.loads(path.read_text())["lines"]} if words[1:] else {}
-    load_before = os.getloadavg()
-    for what, value, unit in itertools.chain.from_iterable(PARTS[part]() for part in parts):
+    conditions = {"machine": machine(), "load_average_before": os.getloadavg()}
+    record = json.loads(path.read_text()) if parts else conditions | {"lines": []}
+    lines = {line["what"]: line for line in record["lines"]}
+    for what, value, unit in itertools.chain.from_iterable(PARTS[part]() for part in parts or PARTS):
         print(f"{what}: {value:.3g} {unit}", flush=True)
         lines[what] = {"what": what, "value": None if math.isnan(value) else float(value), "unit": unit}
+    record |= {part: conditions for part in parts} | {"lines": list(lines.values())}
     folder.mkdir(parents=True, exist_ok=True)
-    record = {"machine": machine(), "load_average_before": load_before, "lines": list(lines.values())}
     path.write_text(json.dumps(record, indent=1) + "\n")
 
 

@@ -37,4 +37,4 @@ __all__ = [
     "policies",
     "scenes",
     "verifies",
-]  # fmt: skip
+]

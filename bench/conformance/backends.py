@@ -145,8 +145,11 @@ def gradient_is_that_of_value(backend: Backend) -> str:
             name = f"{describe(program)}, {distant / 10:g} sigma from theta0"
             found = _findings(backend, program, distant, dtype)
             if program.surrogate and "surrogate" in backend.provides:
-                others = (_findings(backend, other, 1.0, dtype) for other in programs_for(backend, list)
-                          if isinstance(other.contact, type(program.contact)))  # fmt: skip
+                others = (
+                    _findings(backend, other, 1.0, dtype)
+                    for other in programs_for(backend, list)
+                    if isinstance(other.contact, type(program.contact))
+                )
                 require(
                     any(verdict in FAULTS for one in itertools.chain([found], others) for verdict, _ in one),
                     f"{name}: declares a surrogate gradient, but returns the derivative, also on other scenes",
@@ -181,9 +184,14 @@ def _findings(backend: Backend, program: Program, distant: float, dtype: str) ->
         require(gradient.shape == theta.shape, f"{describe(program)}: shape {gradient.shape}, not {theta.shape}")
         require(distant > 1.0 or np.isfinite(gradient).all(), f"{describe(program)}: not finite")
         found, *_ = sampled(
-            lambda at: problem.value(at[:d], at[d:]), np.concatenate([theta, w]), np.concatenate([e, 0.0 * w]), np.ones(COLUMNS), (gradient * e).sum(axis=0),
-            float(np.finfo(_dtype(backend)).eps), EPS if dtype == "float64" else SINGLE_EPS,
-        )  # fmt: skip
+            lambda at: problem.value(at[:d], at[d:]),
+            np.concatenate([theta, w]),
+            np.concatenate([e, 0.0 * w]),
+            np.ones(COLUMNS),
+            (gradient * e).sum(axis=0),
+            float(np.finfo(_dtype(backend)).eps),
+            EPS if dtype == "float64" else SINGLE_EPS,
+        )
         findings = [judge(sample) for sample in found]
         sizes = np.abs(gradient * e).sum(axis=0)
         off = [

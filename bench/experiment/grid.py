@@ -225,11 +225,15 @@ class _Expansion:
         study = study_of(experiment)
         parts = study.parts(parts)
         return Cell(
-            parts, **self._counts(point), study=experiment.study, decision=decision, timing=experiment.timing,
+            parts,
+            **self._counts(point),
+            study=experiment.study,
+            decision=decision,
+            timing=experiment.timing,
             budget=experiment.reference if study.compares(parts) else None,
             path=self._path(parts["scene"], start) if share else None,
             swept=tuple(parameter_name(axis) for axis in used if parts["scene"] and used[axis] == parts["scene"].name),
-        )  # fmt: skip
+        )
 
     def _path(self, scene: Plugin | None, start: Decision) -> Cell:
         """Return the cell at the start of a descent; its contact law has the scene's own values, and none of the sweep's."""

@@ -27,9 +27,17 @@ from typing import Any
 
 OWN = "bench"
 """The package whose code counts by its revisions."""
-SET_BY_RUNS = frozenset((
-    "BENCH_MARK", "BENCH_TRIAL", "JAX_ENABLE_X64", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC",
-))  # fmt: skip
+SET_BY_RUNS = frozenset(
+    (
+        "BENCH_MARK",
+        "BENCH_TRIAL",
+        "JAX_ENABLE_X64",
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "NPROC",
+    )
+)
 """Variables that a run sets in its workers."""
 _SITES = (*site.getsitepackages(), site.getusersitepackages())
 LIBRARIES = tuple(f"{place}/" for folder in _SITES for place in (folder, os.path.realpath(folder)))

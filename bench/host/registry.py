@@ -33,8 +33,16 @@ from bench.host.parameters import Plugin, build, parameters, remember, singular
 BUILT_IN = "bench.plugins"
 """The package of the built-in plugins."""
 KINDS = (
-    "scenes", "contacts", "integrators", "backends", "estimators", "optimizers", "policies", "trainers", "studies",
-)  # fmt: skip
+    "scenes",
+    "contacts",
+    "integrators",
+    "backends",
+    "estimators",
+    "optimizers",
+    "policies",
+    "trainers",
+    "studies",
+)
 """The built-in kinds, in listing order. A plugin may declare another kind."""
 NOT_PLUGINS = ("engines", "robots")
 """Names of the folders with files that only the Pythons of engines import, and with models of robots."""

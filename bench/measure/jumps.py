@@ -217,10 +217,12 @@ def largest_jump(
         nodes = left[:, None] + width * np.linspace(0.0, 1.0, parts + 1)
         at = np.repeat(line, parts + 1)
         places, held = nodes.ravel(), max(1, MOST_POINTS // len(starts))
-        values = np.concatenate([
-            cost(starts[:, part] + (ends[:, part] - starts[:, part]) * places[i : i + held])
-            for i, part in ((i, at[i : i + held]) for i in range(0, len(at), held))
-        ]).reshape(nodes.shape)  # fmt: skip
+        values = np.concatenate(
+            [
+                cost(starts[:, part] + (ends[:, part] - starts[:, part]) * places[i : i + held])
+                for i, part in ((i, at[i : i + held]) for i in range(0, len(at), held))
+            ]
+        ).reshape(nodes.shape)
         values = np.where(np.isfinite(values), values, np.nan)
         if not np.isfinite(values).any():
             return Jump(0.0, span)

@@ -368,7 +368,7 @@ def _bisected(integrand: Callable[[np.ndarray], np.ndarray], ends: np.ndarray) -
 
     Panels between ``ends`` that change when they are halved are halved again, so that spikes, jumps and poles are
     resolved. At a pole 1 / distance^p, the changes of successive halvings fall by the ratio 2^(p - 1), whose fit shows the
-    power p. It is 0 where changes vanish within :data:`SLOW` halvings.
+    power p. It is 0 where changes are rounding after :data:`SLOW` halvings.
     """
     x, w = np.polynomial.legendre.leggauss(NODES)
 
@@ -380,10 +380,12 @@ def _bisected(integrand: Callable[[np.ndarray], np.ndarray], ends: np.ndarray) -
 
     low, high = ends[:-1], ends[1:]
     whole, total, used, changes = panels(low, high), 0.0, low.size * NODES, []
-    limit, closed = SOLVED * float(np.abs(whole).sum()), 0.0
+    size, closed = float(np.abs(whole).sum()), 0.0
+    limit = SOLVED * size
     while True:
         middle = (low + high) / 2.0
         parts = np.stack([panels(low, middle), panels(middle, high)])
+        size = max(size, float(np.abs(parts[np.isfinite(parts)]).sum()))
         used += 2 * low.size * NODES
         change = np.abs(parts.sum(axis=0) - whole)
         changes.append(float(change.sum()))
@@ -396,11 +398,11 @@ def _bisected(integrand: Callable[[np.ndarray], np.ndarray], ends: np.ndarray) -
             break
         low, high = np.concatenate([low[is_open], middle[is_open]]), np.concatenate([middle[is_open], high[is_open]])
         whole = parts[:, is_open].ravel()
-    power = 0.0
-    if len(changes) > SLOW:
-        # any one change may vanish by chance, or be infinite where a node meets the pole
-        tail = np.array(changes[8:])
-        at = np.flatnonzero(np.isfinite(tail) & (tail > 0.0))
+    power, tail = 0.0, np.array(changes[8:])
+    # the first panels may have missed a spike: halvings then go on until rounding alone changes it. Any one change may vanish
+    # by chance, or be infinite where a node meets the pole
+    at = np.flatnonzero(np.isfinite(tail) & (tail > SOLVED * size))
+    if at.size and at[-1] + 8 >= SLOW:
         closed = max(closed, *tail[at[-5:]])
         power = max(1.0 + float(np.polyfit(at, np.log2(tail[at]), 1)[0]), 0.0)
     return total, closed, used, power

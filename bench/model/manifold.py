@@ -79,9 +79,14 @@ class JointScene(EngineScene):
 def _times(xp: Any, a: Any, b: Any) -> Array:
     """Return the product of quaternions ``(4, B)``."""
     (s, x, y, z), (t, u, v, w) = a, b
-    return xp.stack([
-        s * t - x * u - y * v - z * w, s * u + x * t + y * w - z * v, s * v - x * w + y * t + z * u, s * w + x * v - y * u + z * t,
-    ])  # fmt: skip
+    return xp.stack(
+        [
+            s * t - x * u - y * v - z * w,
+            s * u + x * t + y * w - z * v,
+            s * v - x * w + y * t + z * u,
+            s * w + x * v - y * u + z * t,
+        ]
+    )
 
 
 def n_changes(scene: MechanicalScene) -> int:

@@ -22,9 +22,14 @@ DRAWN = 1e30
 SPIKE, TERMINAL = "spike: the largest changes over a step", "terminal cost"
 STYLES = {"": Style("#0072B2", ""), SPIKE: Style("#D55E00", "", width=2.6), TERMINAL: Style("#000000", "o", "none")}
 QUANTITIES = {
-    "gap": "gap [m]", "contacts": "contacts", "force": "force [N]", "jacobian_norm": "|dx_k+1 / dx_k|",
-    "adjoint_norm": "|dL / dx_k|", "cost_stage": "cost", "cost_terminal": "cost",
-}  # fmt: skip
+    "gap": "gap [m]",
+    "contacts": "contacts",
+    "force": "force [N]",
+    "jacobian_norm": "|dx_k+1 / dx_k|",
+    "adjoint_norm": "|dL / dx_k|",
+    "cost_stage": "cost",
+    "cost_terminal": "cost",
+}
 """The panels by the columns that they show."""
 
 
@@ -75,9 +80,21 @@ def chart(trace: Trace) -> Chart:
     marks = [Mark("in contact", time[i] - half, time[j - 1] + half) for i, j in _runs(table["contacts"])]
     marks += [Mark("", time[k] - half) for k in np.flatnonzero(table["switch"])]
     return Chart(
-        "trace", frame, [Column("time", unit="s", log=False)], [Column("value", label=" ")], title=trace.title, series="series",
-        line="line", panel="panel", panel_notes=notes, styles=STYLES, marks=marks, own_scales=True, across=1, height=0.95,
-    )  # fmt: skip
+        "trace",
+        frame,
+        [Column("time", unit="s", log=False)],
+        [Column("value", label=" ")],
+        title=trace.title,
+        series="series",
+        line="line",
+        panel="panel",
+        panel_notes=notes,
+        styles=STYLES,
+        marks=marks,
+        own_scales=True,
+        across=1,
+        height=0.95,
+    )
 
 
 def _runs(values: pd.Series) -> Iterator[tuple[int, int]]:

@@ -17,10 +17,13 @@ def report(table: pd.DataFrame, gradient_error: float) -> list[str]:
     """Return lines on contact, switches, the adjoints' gradient, and the spikes of each measure."""
     switches = np.flatnonzero(table["switch"])
     facts = {
-        "steps": len(table) - 1, "states in contact": int((table["contacts"] > 0).sum()),
-        "largest penetration [m]": table["penetration"].max(), "largest force [N]": table["force"].max(),
-        "relative error of the adjoints' gradient": gradient_error, "contact switches": len(switches),
-    }  # fmt: skip
+        "steps": len(table) - 1,
+        "states in contact": int((table["contacts"] > 0).sum()),
+        "largest penetration [m]": table["penetration"].max(),
+        "largest force [N]": table["force"].max(),
+        "relative error of the adjoints' gradient": gradient_error,
+        "contact switches": len(switches),
+    }
     values = [
         f"{name} {value if isinstance(value, int) else number(value, 3)}"
         for name, value in facts.items()

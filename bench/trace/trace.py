@@ -38,10 +38,21 @@ from bench.trace import sentences
 from bench.trace.contacts import contact_columns
 
 COLUMNS = (
-    "step", "time", "contacts", "switch", "gap", "penetration", "force", "force_peak", "sticking", "slipping",
-    "jacobian_norm", "adjoint_norm", "cost_stage",
+    "step",
+    "time",
+    "contacts",
+    "switch",
+    "gap",
+    "penetration",
+    "force",
+    "force_peak",
+    "sticking",
+    "slipping",
+    "jacobian_norm",
+    "adjoint_norm",
+    "cost_stage",
     "cost_terminal",
-)  # fmt: skip
+)
 """Columns of every trace. Cost terms (``cost_NAME``), states (``q1``, ``v1``) and controls (``u1``) follow."""
 AXES = ("scene", "contact", "integrator", "backend")
 """The axes of a cell that determine its rollout; a trace needs no estimator."""

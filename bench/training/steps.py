@@ -45,9 +45,15 @@ def batches_of(key: Array, count: int, passes: int, batches: int) -> Array:
 
 
 def fit(
-    optimizer: optax.GradientTransformation, loss: Callable[..., Array], network: Any, memory: Any, data: tuple[Array, ...],
-    passes: int, batches: int, key: Array,
-) -> tuple[Any, Any, dict[str, Array]]:  # fmt: skip
+    optimizer: optax.GradientTransformation,
+    loss: Callable[..., Array],
+    network: Any,
+    memory: Any,
+    data: tuple[Array, ...],
+    passes: int,
+    batches: int,
+    key: Array,
+) -> tuple[Any, Any, dict[str, Array]]:
     """Return network, optimizer memory and the log of each step, ``(passes * batches,)``, after descent on a loss.
 
     ``loss(network, *batch)`` is of columns of the ``data``, each ``(N,)`` or ``(n, N)``.

@@ -132,9 +132,20 @@ class FusedProblem(JaxProblem):
         column = (theta.reshape(-1), theta.shape[1], int(not is_shared))
         out = np.empty((rows, batch), self._dtype)
         arguments = (
-            self._parameters, source.constants, source.indices, source.length, *column, *column,
-            w.reshape(-1), batch, out.reshape(-1), batch, rows, 0, batch,
-        )  # fmt: skip
+            self._parameters,
+            source.constants,
+            source.indices,
+            source.length,
+            *column,
+            *column,
+            w.reshape(-1),
+            batch,
+            out.reshape(-1),
+            batch,
+            rows,
+            0,
+            batch,
+        )
         is_small, is_bounded = self._compiled(source.text)(*arguments)
         if not is_small:
             _, is_bounded = self._compiled(kernels.exact(source.text))(*arguments)

@@ -70,10 +70,15 @@ class ImplicitOps(JaxOps):
                 return residual(z[:, None], widened)[:, 0]
 
             solution: Any = optimistix.root_find(
-                function, newton, start, args, max_steps=64, throw=False,
+                function,
+                newton,
+                start,
+                args,
+                max_steps=64,
+                throw=False,
                 adjoint=optimistix.ImplicitAdjoint(linear),
                 tags=frozenset({lineax.diagonal_tag} if scalar else ()),
-            )  # fmt: skip
+            )
             solved = solution.result == optimistix.RESULTS.successful
             # a factor, since jnp.where(solved, value, NaN) would have the gradient of the value
             return solution.value * jnp.where(solved, 1.0, jnp.nan).astype(guess.dtype)

@@ -244,9 +244,13 @@ class Tracer:
 LOGICAL = frozenset({"and", "eq", "ge", "gt", "is_finite", "le", "lt", "ne", "not", "or", "xor"})
 """Operations with a Boolean result."""
 REDUCTIONS = {
-    "reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul", "reduce_or": "or",
+    "reduce_sum": "add",
+    "reduce_max": "max",
+    "reduce_min": "min",
+    "reduce_prod": "mul",
+    "reduce_or": "or",
     "reduce_and": "and",
-}  # fmt: skip
+}
 
 
 def _broadcast(parameters: Any, out: Any, value: np.ndarray, *_: Any) -> np.ndarray:

@@ -89,6 +89,12 @@ class CmaEs(Population):
         squares, axes = np.linalg.eigh((covariance + covariance.T) / 2)
         sigma = state["sigma"] * math.exp(min(1.0, k.c_sigma / k.d_sigma * (norm / k.chi - 1)))
         return {
-            "theta": state["theta"] + state["sigma"] * step, "sigma": sigma, "covariance": covariance, "axes": axes,
-            "lengths": np.sqrt(np.maximum(squares, 1e-20)), "path_sigma": path_sigma, "path_c": path_c, "iteration": i,
-        }  # fmt: skip
+            "theta": state["theta"] + state["sigma"] * step,
+            "sigma": sigma,
+            "covariance": covariance,
+            "axes": axes,
+            "lengths": np.sqrt(np.maximum(squares, 1e-20)),
+            "path_sigma": path_sigma,
+            "path_c": path_c,
+            "iteration": i,
+        }

@@ -25,9 +25,12 @@ class GaussNewton(Optimizer):
     def start(self, theta: np.ndarray) -> OptimizerState:
         """Return the initial state: the initial damping and no evaluated point."""
         return super().start(theta) | {
-            "damping": self.damping, "growth": 2.0, "scale": np.zeros(len(theta)), "known": None,
+            "damping": self.damping,
+            "growth": 2.0,
+            "scale": np.zeros(len(theta)),
+            "known": None,
             "next": np.array(theta, dtype=float),
-        }  # fmt: skip
+        }
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
         return np.array(state["next"][:, None])

@@ -36,8 +36,11 @@ class Lbfgs(Searching):
             if y @ s > 1e-10 * np.linalg.norm(y) * np.linalg.norm(s):
                 steps, changes = [*steps, s][-self.memory :], [*changes, y][-self.memory :]
         return state | {
-            "gradient": gradient, "steps": steps, "changes": changes, "last": (state["theta"], gradient),
-        }  # fmt: skip
+            "gradient": gradient,
+            "steps": steps,
+            "changes": changes,
+            "last": (state["theta"], gradient),
+        }
 
     def direction(self, state: OptimizerState) -> np.ndarray:
         q = np.array(state["gradient"])

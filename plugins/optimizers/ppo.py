@@ -30,8 +30,12 @@ class Ppo(Population):
         """Return the initial state: mean theta, standard deviation ``width``, Adam's means at 0."""
         policy = np.stack([np.array(theta, dtype=np.float64), np.full(len(theta), np.log(self.width))])
         return {
-            "theta": policy[0], "policy": policy, "mean": 0.0 * policy, "square": 0.0 * policy, "step": 0,
-        }  # fmt: skip
+            "theta": policy[0],
+            "policy": policy,
+            "mean": 0.0 * policy,
+            "square": 0.0 * policy,
+            "step": 0,
+        }
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
         mean, log_deviation = state["policy"]

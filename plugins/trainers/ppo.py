@@ -83,16 +83,29 @@ class Ppo(ActorCritic):
             return self.surrogate(actor, seen, action, old, (better - better.mean()) / (better.std() + 1e-8))
 
         actor, memory, log = steps.fit(
-            self.actor_optimizer(env), loss, state.actor, state.memory, (seen, action, old, advantage.reshape(-1)),
-            self.passes, self.batches, key_actor,
-        )  # fmt: skip
+            self.actor_optimizer(env),
+            loss,
+            state.actor,
+            state.memory,
+            (seen, action, old, advantage.reshape(-1)),
+            self.passes,
+            self.batches,
+            key_actor,
+        )
         network, critic_memory, fitted = steps.fit(
-            self.critic_optimizer(env), steps.squared_error, critic.network, critic.memory,
-            (seen, (advantage + before).reshape(-1)), self.passes, self.batches, key_critic,
-        )  # fmt: skip
+            self.critic_optimizer(env),
+            steps.squared_error,
+            critic.network,
+            critic.memory,
+            (seen, (advantage + before).reshape(-1)),
+            self.passes,
+            self.batches,
+            key_critic,
+        )
         log = {name: entries[0] for name, entries in log.items()} | {
             "value_loss": fitted["loss"][-self.batches :].mean() * unit**2,
-            "deviation": jnp.exp(actor.log_deviation).mean(), **windows.log_of(window),
-        }  # fmt: skip
+            "deviation": jnp.exp(actor.log_deviation).mean(),
+            **windows.log_of(window),
+        }
         known = normaliser.updated(state.normaliser, observation)
         return Run(actor, memory, known, episodes, key, Critic(network, critic.target, critic_memory), returns), log

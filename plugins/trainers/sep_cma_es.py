@@ -80,6 +80,12 @@ class SepCmaEs(PopulationTrainer):
         log |= {"deviation": state.sigma * jnp.sqrt(state.variance.mean()), **step_log(-step, change, theta)}
         kind = state.theta.dtype
         return Search(
-            theta.astype(kind), sigma.astype(kind), variance.astype(kind), path_sigma.astype(kind), path_c.astype(kind),
-            state.count + 1, known, key,
-        ), log  # fmt: skip
+            theta.astype(kind),
+            sigma.astype(kind),
+            variance.astype(kind),
+            path_sigma.astype(kind),
+            path_c.astype(kind),
+            state.count + 1,
+            known,
+            key,
+        ), log

@@ -51,9 +51,15 @@ class Shac(ActorCritic):
         targets = windows.td_lambda(window.reward, value, window.ended, self.discount, self.decay)
         seen = windows.flat(window.observation)
         network, critic_memory, fitted = steps.fit(
-            self.critic_optimizer(env), steps.squared_error, critic.network, critic.memory,
-            (normaliser.normalised(state.normaliser, seen), targets.reshape(-1)), self.passes, self.batches, key_critic,
-        )  # fmt: skip
+            self.critic_optimizer(env),
+            steps.squared_error,
+            critic.network,
+            critic.memory,
+            (normaliser.normalised(state.normaliser, seen), targets.reshape(-1)),
+            self.passes,
+            self.batches,
+            key_critic,
+        )
         target = optax.incremental_update(network, critic.target, self.follow)
         log |= {"value_loss": fitted["loss"][-self.batches :].mean(), **windows.log_of(window)}
         known = normaliser.updated(state.normaliser, seen)

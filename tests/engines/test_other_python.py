@@ -213,29 +213,6 @@ def test_limits_of_a_cell_count_its_engine(tmp_path, fault, limit, status, reaso
     ]
 
 
-@pytest.mark.slow
-def test_children_that_plugins_leave_are_killed_and_engines_are_not():
-    """In a process of its own, since all other children end too, such as the browser of other tests."""
-    code = f"""
-import subprocess, sys
-import psutil
-sys.path[:0] = {PATHS!r}
-from bench.host import guard
-from test_other_python import BouncingBall, noise, process, program, registry, toy, TOYS
-registry.add_folder(TOYS)
-problem = toy().compile(program(BouncingBall()))
-problem.value(problem.program.theta0, noise(problem))
-left = subprocess.Popen(["sleep", "100"])
-guard.kill_children()
-assert not psutil.pid_exists(left.pid)
-left.wait(300)
-(engine,) = process._running.values()
-assert engine.process.poll() is None
-"""
-    done = subprocess.run([HERE, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
 # ---------------------------------------------------------------------------------------------------- environments
 
 

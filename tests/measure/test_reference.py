@@ -67,15 +67,19 @@ def test_listed_breakpoints_are_panel_edges():
     [
         ([bank.power(1, 0.2), bank.bump(2.82, 1.8e-4, 3.0 / 1.8e-4)], 1, 0.0, 1e-9, ""),
         ([bank.power(1, 0.2), bank.bump(2.0, 3e-5, 1e5)], 1, 0.0, 2e-8, ""),
+        ([bank.bump(1.3, 1e-5, 1.0)], 1, 0.0, 1e-9, ""),
         ([bank.Piece("far", lambda u: 1e6 + u, lambda u, s: 1.0)], 1, 1e-10, 1e-6, ""),
         ([bank.Piece("pole", lambda u: np.abs(u - 0.5) ** -0.9, lambda u, s: 3.2071)], 1, 0.0, 1.0, "1 / distance^0.9"),
         ([bank.wave(1.0), bank.power(1, -np.exp(-0.5) + 1e-9), bank.power(2)], 2, 0.0, 1e-9, ""),
         ([bank.power(1, 0.2), bank.bump(2.0, 1e-4, 3e4)], 2, 0.0, 10.0, "narrower than the spacing"),
     ],
-    ids=["spike", "narrow spike", "rounding of 1e6", "pole", "effects that cancel", "ridge between points"],
+    ids=["spike", "narrow spike", "nothing but a spike", "rounding of 1e6", "pole", "effects that cancel", "ridge between points"],
 )  # fmt: skip
 def test_quadrature_states_an_error_that_holds(pieces, dim, least, most, words):
-    """No sample meets a spike; two halvings of equal panels show a fourteenth of the error at a pole."""
+    """No sample meets a spike; two halvings of equal panels show a fourteenth of the error at a pole.
+
+    Nothing but a spike was a pole: its halvings went on down to rounding, which falls no further.
+    """
     case = ridge(*pieces, dim=dim, sigma=1.0)
     found = bank.certified(case, SAMPLES)
     assert found.method.startswith("quadrature")

@@ -25,7 +25,7 @@ def test_rules_count_what_they_pass_and_what_they_hold_back():
 def test_trusted_is_said_of_the_checked_program_at_the_same_theta_and_backend(tmp_path):
     made = rows().assign(parameters=lambda frame: [parameters(sigma) for sigma in (0.1, 0.2, 0.3, 0.4)])
     checked = pd.DataFrame(
-        {"parameters": [parameters(0.4), parameters(0.1), parameters(0.1)], "untrusted": [1.0, 0.0, 0.0]}
+        {"parameters": [parameters(0.4), parameters(0.4), parameters(0.1)], "untrusted": [1.0, 0.0, 0.0]}
     )
     (tmp_path / "gradcheck").mkdir()
     checked.to_parquet(tmp_path / "gradcheck" / "rows.parquet")

@@ -19,10 +19,13 @@ class BiasVariance(StudyPackage):
     timed = True
 
     timed_calls: int = param(
-        5, "estimates timed one by one on backends that do not compile; the other repeats are evaluated together",
+        5,
+        "estimates timed one by one on backends that do not compile; the other repeats are evaluated together",
         positive=True,
-    )  # fmt: skip
+    )
     settle_s: float = param(
-        0.02, "time within which calls are repeated until their interquartile range is below 10% of the median", "s",
+        0.02,
+        "time within which calls are repeated until their interquartile range is below 10% of the median",
+        "s",
         low=0.0,
-    )  # fmt: skip
+    )

@@ -62,10 +62,12 @@ def tables(shown: Arranged) -> list[Table]:
     return [
         Table("descent", found, [text("problem"), *PATH], "the descents along which gradients are taken", notes),
         Table(
-            "along_descent", errors, [text("problem"), text("method", label="estimator"), text("backend"), *columns],
+            "along_descent",
+            errors,
+            [text("problem"), text("method", label="estimator"), text("backend"), *columns],
             "errors along descents, in units of the gradient there and of that at the start",
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _named(shown: Arranged, parts: Sequence[str], rows: pd.DataFrame) -> pd.Series:

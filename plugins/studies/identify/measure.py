@@ -392,12 +392,18 @@ def measure(cell: Cell, session: Session, settings: Identify) -> dict[str, Any]:
     single = fit("single", sigma)
     known = information(model, theta, sigma)
     result: dict[str, Any] = {
-        "status": "ok", "reason": "", "rank": known.rank, "condition": known.condition, "fits": data.shape[1],
-        "unknowns": list(model.names), "truth": [math.nan] * len(theta) if is_own else theta.tolist(),
-        "invariants": known.labels, "bound": known.bound.tolist(),
+        "status": "ok",
+        "reason": "",
+        "rank": known.rank,
+        "condition": known.condition,
+        "fits": data.shape[1],
+        "unknowns": list(model.names),
+        "truth": [math.nan] * len(theta) if is_own else theta.tolist(),
+        "invariants": known.labels,
+        "bound": known.bound.tolist(),
         **step_dependence(cell, model, theta, known, sigma),
         **_estimates(single, known, start[:, 0], expressions(settings.terms)),
-    }  # fmt: skip
+    }
     fits = [single, *(fit(shooting, sigma) for shooting in SHOOTING[1:] if has_windows)]
     result |= pd.DataFrame([_fit_statistics(one, known, is_own) for one in fits]).to_dict("list")
     return result
@@ -545,12 +551,17 @@ def _half_widths(fit: Fit, i: int, known: Information) -> tuple[np.ndarray, str]
 TERMS = {
     "start": {"start": "1"},
     "acceleration": {
-        "constant force": "1", "drag v|v|": "v*abs(v)", "drag v^3": "v**3", "dry friction": "sign(v)",
-        "spring q^2": "q**2", "spring q^3": "q**3", "hysteresis": "hysteresis(q)",
+        "constant force": "1",
+        "drag v|v|": "v*abs(v)",
+        "drag v^3": "v**3",
+        "dry friction": "sign(v)",
+        "spring q^2": "q**2",
+        "spring q^3": "q**3",
+        "hysteresis": "hysteresis(q)",
     },
     "control": {"lag": "slope(x)", "dead zone": "sign(x)"},
     "sensor": {"offset": "1", "gain": "x", "drift": "t", "delay": "slope(x)"},
-}  # fmt: skip
+}
 """Effects that a model may lack by where they act, as expressions along the motion.
 
 x is what they act on, q and v are the coordinate that they accelerate, q0, v0, ... the state, and t rises from -1 to 1.
@@ -660,12 +671,14 @@ def _fit_statistics(fit: Fit, known: Information, is_own: bool) -> dict[str, Any
         interval = performance.wilson(round(coverage * n_converged), n_converged)
     names = [f"{name}_{end}" for name in ("converged", "coverage") for end in ("low", "high")]
     return {
-        "shooting": shooting, "optimum": float(fit.has_converged.mean()),
+        "shooting": shooting,
+        "optimum": float(fit.has_converged.mean()),
         "converged": n_converged / n_fits,
         "error": float(np.sqrt(np.mean(np.square(errors)))) if errors.size else math.nan,
-        "coverage": coverage, "hidden": hidden,
+        "coverage": coverage,
+        "hidden": hidden,
         **dict(zip(names, (*performance.wilson(n_converged, n_fits), *interval), strict=True)),
-    }  # fmt: skip
+    }
 
 
 def information(model: Model, theta: np.ndarray, sigma: float) -> Information:

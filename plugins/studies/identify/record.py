@@ -27,15 +27,27 @@ def hysteresis(x: np.ndarray) -> np.ndarray:
 
 
 FUNCTIONS: dict[str, Callable[[Any], Any]] = {
-    "abs": np.abs, "cos": np.cos, "exp": np.exp, "hysteresis": hysteresis, "sign": np.sign, "sin": np.sin,
-    "slope": np.gradient, "sqrt": np.sqrt, "tanh": np.tanh,
-}  # fmt: skip
+    "abs": np.abs,
+    "cos": np.cos,
+    "exp": np.exp,
+    "hysteresis": hysteresis,
+    "sign": np.sign,
+    "sin": np.sin,
+    "slope": np.gradient,
+    "sqrt": np.sqrt,
+    "tanh": np.tanh,
+}
 
 
 OPERATIONS: dict[type[ast.AST], Callable[..., Any]] = {
-    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv, ast.Pow: operator.pow,
-    ast.UAdd: operator.pos, ast.USub: operator.neg,
-}  # fmt: skip
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+    ast.UAdd: operator.pos,
+    ast.USub: operator.neg,
+}
 
 
 def evaluate(text: str, names: Mapping[str, Any]) -> Any:

@@ -75,16 +75,25 @@ def measure(cell: Cell, session: Session, settings: Optimise) -> dict[str, Any]:
     start, stored = cost[0], [path[i] for i in stored_indices(cost)]
     score = float(np.clip((start - final) / (start - optimum), 0.0, 1.0)) if start > optimum else np.nan
     return {
-        **quality, "status": "diverged" if is_lost else "ok",
+        **quality,
+        "status": "diverged" if is_lost else "ok",
         "reason": "; ".join(filter(None, (lost * is_lost, quality.get("reason", "")))),
-        "stopped": stopped, "scene_class": scene_class(cell, problem),
-        "iterations": iterations, "rollouts": rollouts, "gradients": gradients,
+        "stopped": stopped,
+        "scene_class": scene_class(cell, problem),
+        "iterations": iterations,
+        "rollouts": rollouts,
+        "gradients": gradients,
         "gradient_ratio": gradient_ratio(problem, cell) if cell.timing and cell.parts["estimator"] else np.nan,
-        "search_s": seconds, "start_cost": start, "final_cost": final, "best_cost": float(np.nanmin(cost)),
-        "optimum": optimum, "optimum_status": how, "score": 0.0 if is_lost and not np.isfinite(score) else score,
+        "search_s": seconds,
+        "start_cost": start,
+        "final_cost": final,
+        "best_cost": float(np.nanmin(cost)),
+        "optimum": optimum,
+        "optimum_status": how,
+        "score": 0.0 if is_lost and not np.isfinite(score) else score,
         **{f"path_{name}": list(values) for name, values in zip(PATH, zip(*stored, strict=True), strict=True)},
         "theta": theta.tolist(),
-    }  # fmt: skip
+    }
 
 
 def stored_indices(cost: Sequence[float]) -> np.ndarray:
@@ -111,10 +120,12 @@ def follow_path(
             return noise.draw(cell.seed, cell.scene.name, 1, count, width, f"optimise: {what} {iteration}", design)
 
         return advance(
-            optimizer, state, draw(optimizer.draws(problem.dim), problem.dim, "points")[0].T,
+            optimizer,
+            state,
+            draw(optimizer.draws(problem.dim), problem.dim, "points")[0].T,
             lambda points: mean_costs(problem, points, still),
             lambda points: estimates(problem, estimator, points, draw(cell.samples, len(still), "samples", design)),
-        )  # fmt: skip
+        )
 
     state = optimizer.start(theta0)
     step(state, 1)  # compiles, untimed

@@ -36,80 +36,67 @@ LENGTHS = (1e-6, 1e-7, 1e-8)
 
 def measure(cell: Cell, session: Session, settings: Train) -> dict[str, Any]:
     """Return one cell's results by column."""
-    run = _Run(cell, settings)
-    bad = run.finish()
-    table, log = np.array(run.curve), run.log
-    final, norms = table[-1, 3:], _column(log, "gradient_norm")
+    trainer, backend = cell.parts["trainer"], cell.backend
+    assert isinstance(trainer, Trainer)
+    training = _training(cell, backend)
+    env = training.env
+    # all trainers and seeds are evaluated from the same starts
+    starts = noise.draw(0, cell.scene.name, 1, settings.starts, env.n_start, "train: starts")[0].T
+    total, per_update = trainer.updates(env), trainer.steps_per_update(env)
+    marks = set(np.unique(np.linspace(0, total, min(settings.evaluations, total) + 1).round().astype(int)).tolist())
+    checks = _spread(total, settings.cosines) if trainer.first_order else set()
+    halfway = max(total // 2, 1) if trainer.first_order else 0
+
+    state = training.start(cell.seed)
+    training.returns(state, starts)
+    training.compile_update(state)
+    compile_s = training.compile_s
+    curve: list[tuple[float, ...]] = []
+    cosines: list[tuple[float, float, float]] = []
+    log: list[dict[str, float]] = []
+    bad: tuple[int, str] | None = None
+    probe: dict[str, Any] = {}
+    spent = 0.0
+    for update in range(total + 1):
+        if update in marks or update == total:
+            bad = _first_not_finite(log)
+            curve.append((update, update * per_update, spent, *_interval(training.returns(state, starts))))
+            if bad is not None or update == total:
+                break
+        if update in checks:
+            agreement = training.agreement(state, update + 1, settings.copies)
+            cosines.append((update, agreement["cosine"], agreement["cosine_denoised"]))
+        if update == halfway and trainer.first_order:
+            exact = _training(cell, dataclasses.replace(backend, dtype="float64"))
+            probe = {"slope_errors": slope_errors(exact, state), **_windows(training, state, settings.batches)}
+        started = time.perf_counter()
+        state, entry = jax.block_until_ready(training.update(state))
+        spent += time.perf_counter() - started
+        log.append({name: float(value) for name, value in entry.items()})
+
+    table = np.array(curve)
+    final = table[-1, 3:]
+    norms = _column(log, "gradient_norm")
     return {
         "status": "ok" if bad is None else "nonfinite",
         "reason": "" if bad is None else f"{bad[1]} is not finite at update {bad[0]}",
-        "first_return": table[0, 3], "final_return": final[0], "final_return_low": final[1], "final_return_high": final[2],
-        "final_median": final[3], "updates": int(table[-1, 0]), "steps": int(table[-1, 1]), "train_s": run.spent,
-        "compile_s": run.compile_s, "gradient_typical": float(np.nanmedian(norms)), "gradient_peak": float(np.nanmax(norms)),
+        "first_return": table[0, 3],
+        "final_return": final[0],
+        "final_return_low": final[1],
+        "final_return_high": final[2],
+        "final_median": final[3],
+        "updates": int(table[-1, 0]),
+        "steps": int(table[-1, 1]),
+        "train_s": spent,
+        "compile_s": compile_s,
+        "gradient_typical": float(np.nanmedian(norms)),
+        "gradient_peak": float(np.nanmax(norms)),
         "gradient_zero": float((norms == 0).mean()),
-        **run.probe,
+        **probe,
         **{f"curve_{name}": table[:, i].tolist() for i, name in enumerate(CURVE)},
-        **{name: [row[i] for row in run.cosines] for i, name in enumerate(("cosine_update", "cosine", "cosine_denoised"))},
+        **{name: [row[i] for row in cosines] for i, name in enumerate(("cosine_update", "cosine", "cosine_denoised"))},
         **_thinned(log, settings.entries),
-    }  # fmt: skip
-
-
-class _Run:
-    """A training from its start, and what is measured on the way: evaluations, comparisons of gradients, and the log."""
-
-    def __init__(self, cell: Cell, settings: Train) -> None:
-        trainer = cell.parts["trainer"]
-        assert isinstance(trainer, Trainer)
-        self._cell, self._settings, self._first_order = cell, settings, trainer.first_order
-        self._training = _training(cell, cell.backend)
-        env = self._training.env
-        self._total, self._per_update = trainer.updates(env), trainer.steps_per_update(env)
-        # all trainers and seeds are evaluated from the same starts
-        self._starts = noise.draw(0, cell.scene.name, 1, settings.starts, env.n_start, "train: starts")[0].T
-        self._state = self._training.start(cell.seed)
-        self._training.returns(self._state, self._starts)
-        self._training.compile_update(self._state)
-        self.compile_s = self._training.compile_s
-        self.curve: list[tuple[float, ...]] = []
-        """By evaluation, the entries of :data:`CURVE`, and the median return."""
-        self.cosines: list[tuple[float, float, float]] = []
-        """By comparison of first- with zeroth-order gradients: the update, the cosine, and that without noise."""
-        self.log: list[dict[str, float]] = []
-        self.probe: dict[str, Any] = {}
-        """What is measured halfway."""
-        self.spent = 0.0
-        """Seconds of the updates."""
-
-    def finish(self) -> tuple[int, str] | None:
-        """Run to the end, or to the first evaluation after a number that is not finite; return its update and its name, or None."""
-        total = self._total
-        count = min(self._settings.evaluations, total)
-        marks = set(np.unique(np.linspace(0, total, count + 1).round().astype(int)).tolist()) | {total}
-        checks = _spread(total, self._settings.cosines) if self._first_order else set()
-        halfway = max(total // 2, 1)
-        for update in range(total + 1):
-            if update in marks:
-                returns = self._training.returns(self._state, self._starts)
-                self.curve.append((update, update * self._per_update, self.spent, *_interval(returns)))
-                if (bad := _first_not_finite(self.log)) is not None or update == total:
-                    return bad
-            if update in checks:
-                agreement = self._training.agreement(self._state, update + 1, self._settings.copies)
-                self.cosines.append((update, agreement["cosine"], agreement["cosine_denoised"]))
-            if update == halfway and self._first_order:
-                exact = _training(self._cell, dataclasses.replace(self._cell.backend, dtype="float64"))
-                self.probe = {
-                    "slope_errors": slope_errors(exact, self._state),
-                    **_windows(self._training, self._state, self._settings.batches),
-                }
-            self._update()
-        return None
-
-    def _update(self) -> None:
-        started = time.perf_counter()
-        self._state, entry = jax.block_until_ready(self._training.update(self._state))
-        self.spent += time.perf_counter() - started
-        self.log.append({name: float(value) for name, value in entry.items()})
+    }
 
 
 def _training(cell: Cell, backend: Any) -> Training:
