@@ -185,9 +185,10 @@ def _signs(chart: Chart) -> list[str]:
     if not column:
         return []
     is_grey = column.above_one and _is_log(column, chart.frame[column.name]) and _log_range(column, chart.frame)[1] > 1
+    values = chart.frame[column.name]
     is_hollow = (column.limit and chart.frame[column.limit].eq(True).any()) or (
-        chart.frame[column.name] < column.least
-    ).any()
+        column.least and (values < column.least).any()
+    )
     return [f"grey: {column.above_one}"] * bool(is_grey) + ["hollow: an upper limit"] * bool(is_hollow)
 
 

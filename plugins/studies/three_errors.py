@@ -39,8 +39,6 @@ STEPS = 10.0 ** -np.arange(1.0, 9.5, 0.5)
 """Step sizes of the central differences, in the units of theta."""
 CONVERGED = 0.5
 """A cost or gradient converges if its error falls at least to this share from the largest to the smallest step."""
-FLOOR = 1e-4
-"""Smallest error that is drawn; smaller ones, 0 included, are drawn here as upper limits."""
 RESULTS = ("forward_error_rel", "program_error_rel", "model_error_rel", "model_cosine", "model_signs")
 OWN, PHYSICS, TRAP = "program error", "model error", "model error of a trap"
 STYLES = {
@@ -222,7 +220,7 @@ def _dumbbells(shown: Shown, trapped: pd.DataFrame) -> Chart:
     is_trap = errors["problem"].isin(trapped["problem"]) & (errors["series"] == PHYSICS)
     return Chart(
         "three_errors", errors.assign(series=errors["series"].mask(is_trap, TRAP)).reset_index(drop=True),
-        [Column("error", label="relative error", least=FLOOR, log=True, above_one="larger than the gradient")],
+        [Column("error", label="relative error", least=1e-4, log=True, above_one="larger than the gradient")],
         [text("law", label="")], "dots", series="series", panel="panel", styles=STYLES, join=True, across=2, height=0.2,
         subtitle="At the smallest time step." if shown.over else "",
         text="The longer the line, the better a wrong gradient passes a check against differences of its own cost.",

@@ -201,6 +201,14 @@ def test_a_value_of_0_is_hollow_at_the_edge_of_a_logarithmic_axis_and_a_useless_
     assert "1.0e24 ↑" in [text.get_text() for text in panel.texts]
 
 
+def test_a_cost_below_0_is_no_upper_limit():
+    """The subtitle said so of every chart with negative values."""
+    frame = pd.DataFrame({"x": [1.0, 2.0, 3.0], "cost": [-1.0, 2.0, 3.0]})
+    assert "hollow" not in figure_of(Chart("one", frame, [Column("x")], [Column("cost")]))._suptitle.get_text()
+    limited = Chart("one", frame.abs(), [Column("x")], [Column("cost", least=1.5, log=True)])
+    assert "hollow" in figure_of(limited)._suptitle.get_text()
+
+
 def test_beyond_a_named_value_the_chart_is_shaded():
     plain = drawn(small_rows(), ["stiffness"])["bias_variance_stiffness"]
     assert [(mark.name, mark.at, mark.to) for mark in plain.marks] == [("beyond the step size limit", 6400.0, math.inf)]

@@ -37,8 +37,6 @@ from .time_to_accuracy import methods as methods_by_cost
 
 FLOOR = 1e-4
 """Relative errors below this are drawn here, as upper limits."""
-SERIES = 6
-"""Most estimators of a chart along an axis, where the experiment does not name them."""
 GRADES = {0.1: "#08519c", 0.3: "#6baed6", 1.0: "#d6e6f4", 10.0: "#fdae61", math.inf: "#c51b1b"}
 """Upper ends of the grades of an error, and their colours."""
 PANELS = 4
