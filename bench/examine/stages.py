@@ -313,11 +313,11 @@ class GradientStages:
         costs = ((size + options.directions) * (1 + options.repeated) + options.draws * options.directions) * each
         wrong = sum(part.verdict in FAULTS for part in self.check.parts)
         if wrong and options.draws:
-            costs += min(ELSEWHERE, options.draws) * wrong * each
+            costs += min(ELSEWHERE, options.draws) * wrong * each + 4 * options.draws * each
         unclear = wrong + sum(part.verdict == "rounding" for part in self.check.parts)
         if unclear and options.scanned:
             costs += min(unclear + options.directions, options.scanned) * SCAN
-        gradients = 0 if self.gradient is None else 3 + options.draws
+        gradients = 0 if self.gradient is None else 3 + options.draws * (3 if wrong else 1)
         return costs, gradients
 
     def enough(self) -> tuple[float, float]:

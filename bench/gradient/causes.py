@@ -26,19 +26,21 @@ class Ratio(NamedTuple):
 
 
 def causes_of_ratios(
-    components: dict[int, list[Ratio]], directions: list[Ratio], some_right: bool
+    components: dict[int, list[Ratio]], directions: list[Ratio], some_right: bool, right_elsewhere: bool = False
 ) -> dict[int | None, str]:
     """Return the cause of each wrong component by index, and the cause of the wrong directions under the key None.
 
     ``components`` are the ratios of each wrong component to its difference at several thetas, and ``directions`` the
-    ratios of the wrong random directions. ``some_right`` states whether other components are right.
+    ratios of the wrong random directions. ``some_right`` states whether other components are right, and
+    ``right_elsewhere`` whether the whole gradient is right at other thetas.
 
     - ``wrong_factor``: the ratio of each wrong component is the same at all thetas, within its error. A constant ratio
       beside a component with a missing term does not count, since a missing term may act on one input as a factor.
-    - ``missing_term``: the ratio varies, and either other components are right, or the ratio lies between 0 and 2, so
-      the gradient has part of the derivative.
+    - ``missing_term``: the ratio varies, and either other components are right, or the gradient is right at thetas
+      where the term does not act, or the ratio lies between 0 and 2, so the gradient has part of the derivative.
     - ``wrong_adjoint``: neither applies, or there are too few ratios to decide.
     """
+    some_right = some_right or right_elsewhere
     causes: dict[int | None, str] = {c: _cause(ratios, some_right) for c, ratios in components.items()}
     every = [ratio for ratios in components.values() for ratio in ratios]
     if len(components) > 1 and _cause(every, some_right) == "wrong_factor":

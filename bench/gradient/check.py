@@ -34,7 +34,11 @@ LOOSE = 1e-3
 """Largest error of a slope, relative to the largest |gradient * scale|, that a solver which stops early explains."""
 EXPLAINED = 10.0
 """Largest such error as a multiple of the sum of the cost's jumps per unit of a direction."""
-CLEAR = ("smooth", "nonlinear", "mode_crossing", "zero", "nonfinite", "nondeterministic")
+FAR = (1.0, 3.0)
+"""Standard deviations, in units of each input's scale, of thetas where a term such as a contact may be inactive."""
+PLAINLY = ("smooth", "nonlinear", "mode_crossing")
+"""Verdicts that count as right at the thetas drawn with :data:`FAR`."""
+CLEAR = (*PLAINLY, "zero", "nonfinite", "nondeterministic")
 """Verdicts on a direction that is not searched for a staircase."""
 
 
@@ -468,8 +472,29 @@ class _Checker:
         along = [part.ratio_with_error for part in wrong if part.component is None and part.verdict == "wrong_adjoint"]
         is_some_right = any(p.verdict in TRUSTED and p.verdict != "zero" for p in parts if p.component is not None)
         causes = causes_of_ratios(ratios, along, is_some_right)
+        if "wrong_adjoint" in causes.values() and self._is_right_far_away():
+            causes = causes_of_ratios(ratios, along, is_some_right, right_elsewhere=True)
         renamed = [_named(part, causes.get(part.component, causes[None])) for part in parts]
         return renamed, [_named(part, causes[None]) for part in draws]
+
+    def _is_right_far_away(self) -> bool:
+        """Return whether the gradient is right at some theta farther away, so that a missing term acts only near theta.
+
+        The gradient must be right along two random directions, since one may agree by chance. A slope of exactly 0 does
+        not count.
+        """
+        count = self.options.draws
+        away = np.repeat(FAR, count) * self.scale[:, None]
+        thetas = (self.theta[:, None] + away * self.random.standard_normal((self.theta.size, len(FAR) * count))).T
+        right = [(theta, self.gradient(theta)) for theta in thetas]
+        for _ in range(2):
+            vectors = self.scale[:, None] * self.random.standard_normal((self.theta.size, len(right)))
+            lines = [_Line("", *each, vector) for each, vector in zip(right, vectors.T, strict=True)]
+            parts = self._check_lines(lines)
+            right = [
+                each for each, part in zip(right, parts, strict=True) if part.verdict in PLAINLY and part.program != 0.0
+            ]
+        return bool(right)
 
 
 def _real(name: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -70,7 +70,7 @@ DERIVATIVE = {
     ),
     "missing_term": Rule(
         "fault", "part of the derivative is right: a term is missing, detached or counted twice",
-        "`wrong_adjoint` with unequal ratios, where other components are right, or {causes.MOSTLY:.0%} of the ratios "
+        "`wrong_adjoint` with unequal ratios, where other components or thetas are right, or {causes.MOSTLY:.0%} of the ratios "
         "lie between 0 and 2; or wrong at some of `horizons`", FOLLOW, SLOPES, True,
     ),
     "wrong_adjoint": Rule(

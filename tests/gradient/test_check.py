@@ -71,7 +71,7 @@ FAULTS = {
     "large term too many in one component": ("missing_term", cost, lambda x: gradient(x) + first(8.0 * np.cos(9.0 * x[0]))),
     "little left out": ("missing_term", cost, lambda x: gradient(x) - 0.004 * np.cos(x) * [1.0, 0.7, 0.9]),
     "term that acts only here": (
-        "wrong_adjoint", lambda x: cost(x) - 40.0 * np.maximum(0.6 - x[0], 0.0) ** 2 * (x[1] + 3.0 * x[2]), gradient
+        "missing_term", lambda x: cost(x) - 40.0 * np.maximum(0.6 - x[0], 0.0) ** 2 * (x[1] + 3.0 * x[2]), gradient
     ),
     "factor that hardly changes": ("missing_term", cost, lambda x: gradient(x) * (0.5 + 2e-3 * x[1])),
     "wrong beside theta": ("missing_term", cost, lambda x: gradient(x) + 0.3 * (x - THETA)),

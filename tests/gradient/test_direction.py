@@ -111,6 +111,7 @@ NEARLY, NEAR_ONE = [0.5, 0.50005, 0.49995, 0.50005], [1.001, 1.001001, 1.000999,
         ([0.5] * 3 + [0.9, 0.7], 1e-9, {}, "missing_term"),
         ([*PARTLY, -3.0], 1e-9, {}, "missing_term"),
         ([*PARTLY[:3], -1.2, -3.0], 1e-9, {}, "wrong_adjoint"),
+        ([*PARTLY[:3], -1.2, -3.0], 1e-9, {"right_elsewhere": True}, "missing_term"),
     ],
 )
 def test_ratios_and_their_errors_decide_the_cause(values, error, given, cause):
