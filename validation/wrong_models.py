@@ -18,7 +18,9 @@ from bench.plugins.optimizers.gauss_newton import GaussNewton
 from bench.plugins.scenes.mass_spring_damper import MassSpringDamper
 from bench.plugins.scenes.pendulum import Pendulum
 from bench.plugins.studies.identify import adequacy
-from bench.plugins.studies.identify.measure import Fitting, Model, information, missing_terms, run_fits
+from bench.plugins.studies.identify.fitting import Fitting, information, run_fits
+from bench.plugins.studies.identify.missing import missing_terms
+from bench.plugins.studies.identify.model import Model
 from bench.plugins.studies.identify.record import evaluate
 from scipy.stats import norm
 

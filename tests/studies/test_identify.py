@@ -9,12 +9,10 @@ import pytest
 import wrong_models
 from bench.plugins.studies.identify import adequacy
 from bench.plugins.studies.identify import views as shown
+from bench.plugins.studies.identify.fitting import information
 from bench.plugins.studies.identify.information import Information, product
-from bench.plugins.studies.identify.measure import (
-    information,
-    missing_terms,
-    model_of,
-)
+from bench.plugins.studies.identify.missing import missing_terms
+from bench.plugins.studies.identify.model import model_of
 from bench.plugins.studies.identify.record import evaluate
 from helpers import loaded, stored, unmeasured
 from scipy.integrate import solve_ivp
