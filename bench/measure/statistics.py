@@ -453,7 +453,7 @@ def summarise(
             notes.append("all terms are equally far from their mean: the interval of their variance is too narrow")
     return Summary(
         grad_norm=float(np.linalg.norm(mean)) * unit,
-        reference_norm=reference.norm * unit,
+        reference_norm=norm * unit,
         reference_se=reference.standard_error * unit,
         **_ends("bias", [value * unit for value in bias]),
         bias_rel=bias[0] / relative,
