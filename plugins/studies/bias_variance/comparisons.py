@@ -86,7 +86,7 @@ def method_table(shown: Arranged) -> pd.DataFrame:
             "setting": setting_names(problem, axis, rows), "problem": title, **kinds, "axis": along,
             "at": rows["x"] if axis else math.nan, "method": rows["method"], "estimator": rows["label"],
             "error": error, "error_low": low, "error_high": high, "error_is_limit": is_limit,
-            "verdict": verdict(rows["status"], error, low, high, (rows["grad_norm"] == 0) & (rows["variance"] == 0)), "status": rows["status"], "remark": rows["reason"], "trusted": rows["trusted"],
+            "verdict": verdict(rows["status"], error, low, high, (rows["grad_norm"] == 0) & (rows["variance"] == 0)), "status": rows["status"], "remark": rows["reason"], "trusted": rows.get("trusted", ""),
             "bias_share": ((rows["bias_low"] / rows["rmse"]) ** 2).where(error > 0),
             "evaluations": (rows["rollouts"] + rows["gradients"]) / samples, "time_s": rows["seconds"],
             "rollouts": rows[ROLLOUTS], "has_law": has_law(rows), "has_fixed_work": declares(rows, "fixed_work"),
