@@ -1,7 +1,8 @@
 """Imports plugin files from outside in a separate process first, so that no import can end a command or change its numbers.
 
-A function of a library that a file replaces would compute numbers of other plugins too. A crash, ``os._exit`` or an endless loop cannot be caught within its own process. A child process therefore imports each
-file, once in a command. It writes a line before each, so the last one is the file that has ended it.
+A function of a library that a file replaces would compute numbers of other plugins too. A crash, ``os._exit`` or an
+endless loop cannot be caught within its own process. A child process therefore imports each file, once in a command. It
+writes a line before each, so the last one is the file that has ended it.
 """
 
 from __future__ import annotations
@@ -63,6 +64,7 @@ def run_child(job: Mapping[str, Any]) -> None:
     for name, folder in job["packages"].items():
         sys.modules[name] = package = ModuleType(name)
         package.__path__ = [folder]
+    importlib.import_module("bench.model")  # what plugins build on, with its libraries
     before = guard.library_functions()
     for name in job["modules"]:
         os.write(output, b"\n")
