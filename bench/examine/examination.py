@@ -318,8 +318,8 @@ class _Examination:
         for group in self.stages.groups:
             part = slice(group.first, group.last)
             slope, scale = np.abs(gradient[part]), setup.scale[part]
-            sizes_of = setup.tolerated(part, slope), slope
-            allowed, whole = (float(np.linalg.norm(scale * each)) for each in sizes_of)
+            per_input = setup.tolerated(part, slope), slope
+            allowed, whole = (float(np.linalg.norm(scale * each)) for each in per_input)
             sizes[group.name] = GroupSize(slope.size, allowed, whole)
         return sizes
 

@@ -255,7 +255,7 @@ def _refuse_unread(experiment: Experiment, overrides: Sequence[Override]) -> Non
     names = {*_settings() - {*kinds, *kinds.values()}, "experiment", *used, *used.values()}
     names |= {f"{axis}.{entry.name}" for axis, entry in choices}
     plugins = _in_use([entry.plugin for _, entry in choices if entry.plugin])
-    axes = {name for e in every for name in swept(e.sweep)}
+    axes = set(swept(experiment.whole_sweep))
     for (head, *more), value in overrides:
         tables = more[:1] or (value if isinstance(value, dict) else ())
         for name in [f"{head}.{table}" for table in tables] if head in kinds.values() else [head]:

@@ -216,9 +216,8 @@ def _error_and_cost(shown: Arranged, subtitle: str) -> Chart | None:
 def _contrast(shown: Arranged, subtitle: str) -> Chart | None:
     """Return error against time at two values of an axis, joined by arrows, as the experiment's ``compares`` names them."""
     program = problem_numbers(shown.rows, PROBLEM)
-    cost = (
-        shown.rows[[COST.name, COST.low, COST.high]].groupby(program).transform("first")
-    )  # all its cells have the same
+    # cells of one program have the same costs, and those that use costs store them
+    cost = shown.rows[[COST.name, COST.low, COST.high]].groupby(program).transform("first")
     rows = with_known(shown.rows.assign(**cost), TIME)
     joined_axis: tuple[Axis, Sequence[Any]] | None = None
     for name, values in shown.experiment.compares.items():
@@ -235,9 +234,8 @@ def _contrast(shown: Arranged, subtitle: str) -> Chart | None:
     along, (start, end) = joined_axis
     parts = [_on_fastest(part) for _, part in rows.groupby(["series", "contact"], sort=False)]
     frame = pd.concat(parts).sort_values(along.column, key=lambda at: at == end, kind="stable")
-    frame[TIME] = frame.groupby(["series", "contact"])[TIME].transform(
-        "median"
-    )  # the same program: what differs is noise
+    # one program at both settings: what differs is noise
+    frame[TIME] = frame.groupby(["series", "contact"])[TIME].transform("median")
     frame = frame.assign(arrow=frame["series"] + ", " + frame["contact"], line=frame["contact"].str.partition("[")[0])
     return Chart(
         "contrast", frame, [SECONDS], [RMSE, *[COST] * bool(frame["cost"].notna().any())], "points", series="series", line="line",
@@ -247,9 +245,9 @@ def _contrast(shown: Arranged, subtitle: str) -> Chart | None:
     )  # fmt: skip
 
 
-def _on_fastest(rows: pd.DataFrame, cost: str = TIME) -> pd.DataFrame:
-    """Return an estimator's rows on the backend with the lowest cost, by the median over its settings."""
-    return rows[rows["line"] == rows.groupby("line")[cost].median().idxmin()]
+def _on_fastest(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return an estimator's rows on its fastest backend, by the median over its settings."""
+    return rows[rows["line"] == rows.groupby("line")[TIME].median().idxmin()]
 
 
 def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Chart:

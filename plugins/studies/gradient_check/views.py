@@ -56,7 +56,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     ]
     tables = [
         Table("gradient_verdicts", *_verdicts(points), title="Verdicts", files=[], page=True, terminal=True),
-        Table("gradient_check", *_lines(shown, points), data=long_table(with_axes(experiment.sweep, rows)),
+        Table("gradient_check", *_lines(shown, points), data=long_table(with_axes(experiment.whole_sweep, rows)),
               title="gradients against differences of the cost", notes=[NOTE, *faults, *reasons(rows)]),
         Table("gradient_components", component_table(rows), [], files=["csv"]),
     ]  # fmt: skip
