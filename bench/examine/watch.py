@@ -16,6 +16,7 @@ import numpy as np
 
 from bench.errors import UserError, failure, needing_sweeps
 from bench.examine.few import ROUNDS, FewSteps
+from bench.examine.lines import scan
 from bench.examine.subspace import Group, Subspace
 from bench.gradient import FAULTS, RULES
 from bench.simulator.simulator import Simulator
@@ -27,11 +28,15 @@ DIRECTIONS = 2
 """Random directions along which a gradient is compared with differences."""
 PAIRS = 8
 """Mirrored pairs of a zeroth-order estimate."""
+SHARES = (1.0, 0.1, 0.01)
+"""Shares of the last step's length at which a step against the gradient is tried."""
+LINE = (9, 6, 1)
+"""Points, halvings and places of the search for jumps along the last step."""
 FIRST_STEP = 1e-3
 """Length of a step before the first one, in units of the scale of theta."""
 COLUMNS = (
     "iteration", "cost", "gradient_norm", "verdict", "error", "noise", "ratio", "ratio_low", "ratio_high", "cosine",
-    "cosine_low", "cosine_high", "costs", "seconds", "reason",
+    "cosine_low", "cosine_high", "jumps", "largest_jump", "lowers", "costs", "seconds", "reason",
 )  # fmt: skip
 LARGER, EARLIER = 200.0, 3
 """Factor on the largest norm of at least this number of earlier checks above which a gradient explodes."""
@@ -51,8 +56,9 @@ class Watch:
     at which the gradient was of no use.
 
     ``rows`` has a line per checked iteration: the norm of the gradient, the verdict of a check along random directions
-    with the largest relative error, the difference of two equal calls of the cost, and ratio and cosine of a zeroth-order estimate
-    from mirrored pairs to the gradient, with 95% intervals.
+    with the largest relative error, the difference of two equal calls of the cost, ratio and cosine of a zeroth-order estimate
+    from mirrored pairs to the gradient, with 95% intervals, the jumps along the last step, and the share of its length
+    at which a step against the gradient lowers the cost (0: at none).
 
     >>> log = Watch(lambda x: float(x @ x), every=1, share=math.inf)
     >>> log(np.array([1.0, 2.0]), np.array([2.0, 4.0]))
@@ -150,7 +156,8 @@ class Watch:
         }  # fmt: skip
         if np.isfinite(slopes).all():
             has_moved = self._before.size == at.size and (self._before != at).any()
-            row |= _pairs(costs, at, slopes, at - self._before if has_moved else FIRST_STEP * scale, draw)
+            step = at - self._before if has_moved else FIRST_STEP * scale
+            row |= _pairs(costs, at, slopes, step, draw) | _along(costs, at, slopes, step, value, noise, simulator.unit)
         return row | {"costs": simulator.clock.costs - before}
 
     @property
@@ -224,6 +231,23 @@ def _pairs(
     return {f"ratio{end}": value for end, value in ends.items()} | {
         f"cosine{end}": float(np.clip(value * to_cosine, -1.0, 1.0)) for end, value in ends.items()
     }
+
+
+def _along(
+    costs: Costs, at: np.ndarray, slopes: np.ndarray, step: np.ndarray, value: float, noise: float, unit: float
+) -> dict[str, float]:
+    """Return the jumps along the last step, and the share of its length at which a step against the gradient lowers the cost."""
+    line = scan(lambda t: costs(at[:, None] + step[:, None] * (t - 1.0) / 2.0), step, noise, 1.0, LINE, unit)
+    length, norm = float(np.linalg.norm(step)), float(np.linalg.norm(slopes))
+    down = -slopes * length / norm if norm else np.zeros_like(slopes)
+    changes = costs(at[:, None] + down[:, None] * np.array(SHARES)) - value
+    rounding = 16.0 * (unit * abs(value) + noise)
+    lowered = [share for share, change in zip(SHARES, changes, strict=True) if change < 0.0]
+    is_known = bool((changes > rounding).all())
+    return {
+        "jumps": len(line.jumps), "largest_jump": max((jump.size for jump in line.jumps), default=0.0),
+        "lowers": max(lowered) if lowered else 0.0 if is_known else math.nan,
+    }  # fmt: skip
 
 
 @contextmanager
