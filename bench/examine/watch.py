@@ -98,11 +98,14 @@ class Watch:
         changes neither theta nor the state of random generators.
         """
         self.iteration += 1
+        if self.iteration % self.every == 0 and self._is_affordable():
+            self._check(theta, gradient, w)
         if (self.iteration + 1) % self.every == 0:
-            with suppress(Exception):  # the check then has no last step
+            with suppress(Exception):  # the next check then has no last step
                 self._before = ParameterTree(theta).vector.copy()
-        if self.iteration % self.every or not self._is_affordable():
-            return
+
+    def _check(self, theta: Any, gradient: Any, w: Any) -> None:
+        """Add a row on the gradient at theta, and write it."""
         began = time.perf_counter()
         row: dict[str, Any] = dict.fromkeys(COLUMNS, math.nan) | {
             "iteration": self.iteration,

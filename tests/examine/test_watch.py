@@ -57,6 +57,18 @@ def test_a_sound_loop_is_silent(seed):
     assert [row["iteration"] for row in log.rows] == list(range(0, 200, 20))
 
 
+@pytest.mark.parametrize(("sign", "lowers"), [(1.0, 1.0), (-1.0, 0.0)])
+def test_a_check_tells_the_jumps_along_the_last_step_and_whether_a_step_against_the_gradient_lowers_the_cost(
+    sign, lowers
+):
+    log = bench.watch(lambda x: float(x @ x) + 5.0 * (x[0] > 1.5), every=1, share=math.inf)
+    for theta in np.array([[2.0, 1.0], [1.0, 1.0]]):
+        log(theta, sign * 2.0 * theta)
+    last = log.rows[-1]
+    assert (last["jumps"], last["lowers"]) == (1, lowers)
+    assert last["largest_jump"] == pytest.approx(5.0, rel=0.2)
+
+
 def test_a_term_that_is_detached_is_named_from_its_iteration_on():
     log, _ = adam(True, updates=260, fault="detached", at=200)
     iteration, reason = log.first
