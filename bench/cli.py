@@ -507,21 +507,21 @@ VERBS = {
         "Cells that cannot run are listed with their reason.\n" + SETTINGS, "Experiments",
     ),
     "list": Verb(
-        _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins by kind; of a KIND or NAME parameters and availability",
+        _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins by kind; for a KIND or NAME also parameters and availability",
         "KIND is scenes, contacts, integrators, backends, estimators, optimizers, policies, trainers or studies.\n", "Experiments",
     ),
     "engines": Verb(
-        _main_of("bench.engines.command"), "engines [install NAME ... [--again] | table [NAME ...]] [plugins=DIR]",
-        "physics engines in a Python of their own: versions, installation, table",
-        "Without arguments: each engine's environment, or how to make it. install makes it from the engine's requirements;\n"
-        "--again makes it from the start. The environments are in $BENCH_ENGINES, otherwise in the user's cache. table runs the\n"
-        "conformance set and engine_gradients (its settings: key=value) on all\n"
-        "that are installed, and writes a page and a CSV into out=DIR.\n", "Experiments",
+        _main_of("bench.engines.command"), "engines [install NAME ... | table [NAME ...] | set OUT | metamorphic MODEL]",
+        "physics engines in a Python of their own, and tests for any engine",
+        "Without arguments it lists each engine's environment, or how to make it. The environments are in $BENCH_ENGINES,\n"
+        "otherwise in the user's cache. plugins=DIR: engines of your own. NAME==VERSION: another release.\n  install      makes environments from the engines' requirements; --again makes them from the start\n"
+        "  table        writes a page and a CSV of the conformance set and engine_gradients (key=value: its settings), out=DIR\n"
+        "  set          copies the conformance set into OUT\n  metamorphic  checks mujoco, or NAME, on MODEL without a reference: steps=60 seed=0\n", "Experiments",
     ),
     "check": Verb(
         _check, "check [NAME ...] [limit=15m] [plugins=DIR] [option of pytest ...]", "plugins: does each do what it declares?",
-        "Runs the conformance kit on some plugins, or all, in pytest: -k WORD selects checks, -x stops at the first\n"
-        "failure, --junitxml=FILE writes a report. A check fails that takes longer than `limit` or ends its process.\n"
+        "Runs the conformance kit on the named plugins, or on all, in pytest: -k WORD selects checks, -x stops at the first\n"
+        "failure, --junitxml=FILE writes a report. A check that takes longer than `limit` or ends its process fails.\n"
         "Exit status 1 when a check fails.\n\n" + FAMILY, "Is it right?",
     ),
     "gradcheck": Verb(
@@ -544,9 +544,9 @@ VERBS = {
         "Exit status 1 when a claim is not reproduced.\n",
     ),
     "compare": Verb(
-        _main_of("bench.compare.command"), "compare BEFORE AFTER [again=DIR,DIR] [out=DIR]", "two results, cell by cell: 1 when something got worse",
-        "BEFORE and AFTER are directories, or git revisions as REV or REV:PATH. Accuracy decides, paired on equal noise;\n"
-        "times only with again=DIR,DIR, further runs of BEFORE, whose spread they are compared with.\n"
+        _main_of("bench.compare.command"), "compare BEFORE AFTER [again=DIR,DIR] [out=DIR]", "two results, cell by cell; status 1 if a cell got worse",
+        "BEFORE and AFTER are directories, or git revisions as REV or REV:PATH. Errors decide, paired on equal noise. Times\n"
+        "decide only with again=DIR,DIR: further runs of BEFORE, whose spread they are compared with.\n"
         "Written to out=DIR (runs/compare): compare.csv and .md.\n",
     ),
     "index": Verb(
@@ -554,7 +554,7 @@ VERBS = {
         "DIR is results by default. Written to DIR/index.html. Nothing is simulated.\n",
     ),
     "history": Verb(
-        _main_of("bench.compare.history"), "history DIR DIR ... [out=DIR]", "errors and failures over versions, as one small chart",
+        _main_of("bench.compare.history"), "history DIR DIR ... [out=DIR]", "the error of each estimator over versions, as a chart and a table",
         "Directories or git revisions, the oldest first. Written to out=DIR (runs/history): history.png, .csv and .md.\n",
     ),
 }  # fmt: skip
