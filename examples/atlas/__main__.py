@@ -39,16 +39,16 @@ GOOD = ("right", "usable", "no jumps")
 INTRODUCTION = """\
 # Simulators that others wrote
 
-`bench.examine` on {count} packages, used as their documentation shows or as one writes it first, beside the truth, which `truth()` in the
-simulator's file computes: {score}.
+You can read here what `bench.examine` says of {count} packages, used as their documentation shows or as one writes it first, beside the truth, which
+`truth()` in the file of each simulator computes. Answers: {score}.
 
-    python -m examples.atlas install NAME    # into a Python that it shares with others of its kind
-    python -m examples.atlas examine NAME    # or without names: all, then `page` writes this page
+    python -m examples.atlas install NAME    # NAME is a file here without .py; some packages share an environment
+    python -m examples.atlas examine NAME    # without names all; then `page` writes this page
 
 <!-- figures: python -m examples.atlas page -->
-*off*: largest distance of the package's derivative from the truth, relative to the largest component. *s*: processor seconds with compilation.
-The truth is differentiated by complex steps. A smooth cost's gradient is usable under noise. An empty column: `examine` agrees with the truth.
-Last examined on {date}. Not examined: jax-fem, which needs PETSc, and fdtdx, rewarped and playground, which pip installs.
+*off* is the largest distance of the package's derivative from the truth, relative to the largest component, and *s* processor seconds with
+compilation. The truth is differentiated by complex steps. The verdict is empty if `examine` agrees with the truth. Last examined on {date}. Not
+examined: jax-fem, which needs PETSc, fdtdx, rewarped and playground.
 """
 
 
@@ -151,7 +151,7 @@ def page():
         count=len({each["package"] for each in facts}), date=max(row["date"] for row in rows.values()),
         score=", ".join(f"{n} {word.removesuffix('s')}" for word, n in Counter(words.values()).most_common()),
     )  # fmt: skip
-    table = ["| package | simulator | `examine` says | truth | off | | s |", "|---|---|---|---|--:|---|--:|"]
+    table = ["| package | simulator | `examine` says | truth | off | verdict | s |", "|---|---|---|---|--:|---|--:|"]
     for each in facts:
         row = rows[each["name"]]
         said = [row["derivative"], row.get("use"), each.get("jumps") and row.get("jumps"), f"`{row.get('cause')}`"]
