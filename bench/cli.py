@@ -157,7 +157,7 @@ def _dispatch(words: list[str]) -> int:
     if not words or words[0] in ("-h", "--help", "help"):
         _print_overview()
         return 0 if words else 2
-    if words[0] in ("--version", "-V"):
+    if words[0] == "-V" or "--version" in words:
         from bench import __version__
 
         print(f"bench {__version__}")

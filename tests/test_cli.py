@@ -127,8 +127,10 @@ def test_every_verb_has_help(verb, capsys):
     assert answer.err == ""
 
 
-def test_version(capsys):
-    assert main(["--version"]) == 0
+@pytest.mark.parametrize("words", [["--version"], ["plan", "--version"]])
+def test_version(words, capsys):
+    """After a verb it was an unknown option."""
+    assert main(words) == 0
     assert capsys.readouterr().out.startswith("bench 0.")
 
 

@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-CPU, MEMORY = 40, 6 << 30
+CPU, MEMORY = 90, 6 << 30
 """Limits for the tests of one fault: CPU seconds, and bytes of address space."""
 ROOT = Path(__file__).resolve().parents[1]
 COPIED = ("bench", "plugins", "conf", "tests", "validation", "docs", "README.md", "CONTRIBUTING.md", "pyproject.toml")

@@ -212,7 +212,6 @@ def largest_jump(
     left, width = np.zeros(count), 1.0
     span = noise = size = 0.0
     single = True
-    changes = [0.0]
     while True:
         nodes = left[:, None] + width * np.linspace(0.0, 1.0, parts + 1)
         at = np.repeat(line, parts + 1)
@@ -234,7 +233,6 @@ def largest_jump(
         highest, part = np.unravel_index(int(steps.argmax()), steps.shape)
         where = int(line[highest]), float(nodes[highest, part : part + 2].mean())
         bends = np.nan_to_num(np.abs(np.diff(values, 2, axis=1)))
-        changes.append(float(steps.max()))
         if width / parts < FINEST:
             # at this length only a jump exceeds rounding
             noise = float(np.median(bends))
@@ -242,7 +240,7 @@ def largest_jump(
             best = int(np.argmax(isolated))
             at_jump = int(steps[best].argmax())
             where = int(line[best]), float(nodes[best, at_jump : at_jump + 2].mean())
-            changes[-1] = float(isolated[best])
+            change = float(isolated[best])
             break
         row, place = np.unravel_index(np.argsort(bends, axis=None)[-SUSPECTS:], bends.shape)
         # number of intervals into which a suspicious interval and its neighbour are divided at every further level
@@ -250,10 +248,9 @@ def largest_jump(
     if single:
         # steps of rounding are flat at the last level, so that they have no median bend
         noise = max(noise, SINGLE * size)
-    # change of a cost, relative to its range on the lines, below which rounding may hide that the change still
-    # shrinks
-    stays = changes[-1] > 0.1 * changes[-2] and changes[-1] > max(1e-6 * span, LOUD * noise)
-    return Jump(changes[-1] if stays else 0.0, span, *where)
+    # below this share of the range of the cost on the lines rounding may hide that a change still shrinks
+    is_jump = change > max(1e-6 * span, LOUD * noise)
+    return Jump(change if is_jump else 0.0, span, *where)
 
 
 def _isolated(values: np.ndarray, steps: np.ndarray) -> np.ndarray:

@@ -39,7 +39,7 @@ def test_trusted_is_said_of_the_checked_program_at_the_same_theta_and_backend(tm
     ):
         answers = trust.trusted(tmp_path, made.iloc[:1].assign(parameters=changed))
         assert answers.tolist() == ["not checked"]
-    assert trust.headline(answers) == "trusted: fobg 1 not checked; python -m bench gradcheck SCENE checks"
+    assert trust.headline(answers) == "trusted: fobg 1 not checked (to check: python -m bench gradcheck SCENE)"
     assert set(trust.trusted(tmp_path, made.assign(estimator="reinforce"))) == {""}
 
 

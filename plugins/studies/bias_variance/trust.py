@@ -75,7 +75,7 @@ def _program(text: str) -> str:
 def headline(answers: pd.Series) -> str:
     """Return in how many rows of ``fobg`` the estimates can be trusted; empty without any."""
     counts = {answer: int((answers == answer).sum()) for answer in ("yes", "no", "not checked")}
-    how = "; python -m bench gradcheck SCENE checks" * bool(counts["not checked"])
+    how = " (to check: python -m bench gradcheck SCENE)" * bool(counts["not checked"])
     listed = ", ".join(f"{count} {answer}" for answer, count in counts.items() if count)
     return f"trusted: fobg {listed}{how}" if listed else ""
 
