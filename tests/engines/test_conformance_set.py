@@ -181,17 +181,14 @@ class Planted:
     ("change", "reason", "at"),
     [
         (lambda by, all: -by, "-1 times", "free_joint qpos"),
-        (lambda by, all: 0.004 * by, "0.004 times", "free_joint qpos"),
         (lambda by, all: 0.0 * by, "0", "free_joint qpos"),
         (lambda by, all: all["qvel"], "the numbers of qvel", "weld qpos"),
         (lambda by, all: by[[3, 4, 5, 0, 1, 2]], "in the order [3, 4, 5, 0, 1, 2]", "elliptic_slide qpos"),
         (lambda by, all: np.append([0, 0], by[:-2]), "shifted by +1", "offset_slide controls"),
         (lambda by, all: np.append(by[:-1], 0.0), "qpos[5]: 0", "free_joint qpos"),
         (lambda by, all: np.abs(by), "qpos[1]: -1 times", "offset_slide qpos"),
-        (lambda by, all: by * [2, 2, 2, 2, 2, 1], "qpos except [5]: 2 times", "free_joint qpos"),
         (lambda by, all: by + np.array([0, 0, 0.5, 0, 0, 0.2]), "qpos[2, 5]: 0.71 instead of 0.21", "free_joint qpos"),
         (lambda by, all: 1e-3 * by[::-1], "qpos[2]: 0.00989847 instead of 75.6466", "weld qpos"),
-        (lambda by, all: by * [1, np.nan, 1, np.inf, 1, 1], "2 of 6 numbers not finite", "free_joint qpos"),
         (lambda by, all: np.inf * by, "12 of 12 numbers not finite", "weld qpos"),
     ],
 )

@@ -109,7 +109,6 @@ def test_the_command_prints_each_property_and_fails_where_one_is_broken(capsys):
     assert main(["engines", "metamorphic", str(LOOP), "steps=6"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("dense = sparse                     holds   ")
-    assert lines[-1].startswith("mujoco 3.")
     assert main(["engines", "metamorphic", str(LOOP), "brax"]) == 2
     assert "engine brax: it is not installed" in capsys.readouterr().err
     assert main(["engines", "metamorphic", str(LOOP), "steps=0"]) == 2
