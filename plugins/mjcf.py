@@ -232,11 +232,8 @@ class Contacts:
             return []
         contacts = self._data.contact
         is_active = contacts.dist < contacts.includemargin
-        return [
-            (self._pairs[min(pair), max(pair)], i)
-            for i, pair in enumerate(contacts.geom.tolist())
-            if is_active[i] and (min(pair), max(pair)) in self._pairs
-        ]
+        pairs = map(tuple, np.sort(contacts.geom).tolist())
+        return [(self._pairs[pair], i) for i, pair in enumerate(pairs) if is_active[i] and pair in self._pairs]
 
 
 def _pairs(model: Any) -> list[tuple[int, int]]:

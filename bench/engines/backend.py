@@ -23,6 +23,7 @@ class EngineBackend(Backend):
     """
 
     uses = (adjoint,)
+    requires = ("mujoco",)
     provides = frozenset({"value", "grad", "score", "physics"})
 
     file: ClassVar[str]
@@ -41,6 +42,9 @@ class EngineBackend(Backend):
 
     solver_error: ClassVar[float] = 0.0
     """Relative difference that an iterative solver of contact forces, which stops early, causes in costs."""
+
+    reads_mjcf: ClassVar[bool] = False
+    """Whether the engine reads the twin's MJCF itself, and so has its ground, which may not be z = 0."""
 
     has_friction: ClassVar[bool] = False
     """Whether it runs contacts with friction."""
@@ -78,6 +82,8 @@ class EngineBackend(Backend):
             model = twin.read(program.scene.mjcf())  # type: ignore[attr-defined]
             if not self.has_friction and any(contact["friction"] for contact in model["contacts"]):
                 return f"{self.name} runs contacts without friction only"
+            if not (model["is_level"] or self.reads_mjcf):
+                return f"{self.name}'s ground is z = 0"
             return self.twin_refusal(program, model)
         except Unsupported as error:
             return str(error)

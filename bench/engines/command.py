@@ -10,9 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bench.engines import environments, table
-from bench.engines.backend import EngineBackend
 from bench.engines.conformance import metamorphic
-from bench.errors import UserError, local_path, printable, unknown
+from bench.errors import UserError, local_path, printable
 from bench.model import registry
 
 OUT = Path("results/engines_table")
@@ -44,23 +43,16 @@ def main(words: Sequence[str]) -> int:
 
 def _install(words: Sequence[str], again: bool) -> int:
     """Make the environments of ``NAME`` or ``NAME==VERSION``; return 1 if an engine cannot be used then."""
-    engines, requirements = _engines(), {}
-    for word in words:
-        name, _, release = word.partition("==")
-        plugin = registry.find("backends", name).plugin if release else engines.get(name)
-        if plugin is None:
-            raise unknown("engine", name, engines)
-        requirements[word] = (
-            engines[name].files()[0].with_suffix(".txt") if name in engines else table.file_of(plugin, ".txt")
-        )
-        if not requirements[word].exists():
-            raise UserError(f"engine {name} has no file of requirements {requirements[word]}")
-    for word, file in requirements.items():
+    files = {word: table.Engine(word).file(".txt") for word in words}
+    for word, file in files.items():
+        if not file.exists():
+            raise UserError(f"engine {word} has no file of requirements {file}")
+    for word, file in files.items():
         started = time.perf_counter()
         place = environments.install(word, file, again=again)
         size = sum(file.lstat().st_size for file in place.rglob("*"))
         print(f"{word}: installed in {place}, {size / 2**20:.0f} MiB, {time.perf_counter() - started:.0f} s")
-        if word in engines and (reason := engines[word]().unavailable_reason()):
+        if reason := table.Engine(word).missing:
             print(f"bench: {reason}", file=sys.stderr)
             return 1
     return 0
@@ -70,18 +62,10 @@ def _table(words: Sequence[str]) -> int:
     """Write the table of the named engines, or of all, and print the page's path."""
     settings = [word for word in words if "=" in word and "==" not in word]
     names = [word for word in words if word not in settings]
-    for name in names:
-        registry.find("backends", name.partition("==")[0])
     places = [word for word in settings if word.startswith("out=")]
     out = local_path("out", places[-1].partition("=")[2]) if places else OUT
-    print(table.write(names, out, [word for word in settings if word not in places]))
+    print(table.write([table.Engine(name) for name in names], out, [word for word in settings if word not in places]))
     return 0
-
-
-def _engines() -> dict[str, type[EngineBackend]]:
-    """Return the engines by name."""
-    entries = registry.entries()["backends"].items()
-    return {name: e.plugin for name, e in entries if e.plugin is not None and issubclass(e.plugin, EngineBackend)}
 
 
 def _write_set(out: Path) -> int:
@@ -96,14 +80,14 @@ def _write_set(out: Path) -> int:
 
 
 def _metamorphic(model: str, words: Sequence[str]) -> int:
-    """Print a line per property of an engine on a model, by default of ``mujoco``; return 1 if one does not hold."""
+    """Print a line per property of an engine on a model, by default of ``mujoco``; return 1 if one is broken, or all unchecked."""
     if not Path(model).is_file():
         raise UserError(f"engines metamorphic: the file {model} does not exist: {USAGE}")
     settings = [word for word in words if "=" in word and "==" not in word]
-    if strange := [word for word in settings if not re.fullmatch(r"(steps|seed)=\d+", word)]:
+    if strange := [word for word in settings if not re.fullmatch(r"steps=[1-9]\d*|seed=\d+", word)]:
         raise UserError(f"engines metamorphic: {' '.join(strange)} is not a setting: {USAGE}")
     name = next((word for word in words if word not in settings), "mujoco")
-    rows = table.rows_of(name, metamorphic, str(Path(model).resolve()), *settings)
+    rows = table.Engine(name).rows(metamorphic, str(Path(model).resolve()), *settings)
     if "property" not in rows[0]:
         raise UserError(f"engines metamorphic: {rows[0]['reason']}")
     for row in rows:
@@ -114,14 +98,15 @@ def _metamorphic(model: str, words: Sequence[str]) -> int:
             f"{row.get('property', ''):<35}{state:<8}{size:<20}{': '.join([*at, *filter(None, [row['reason']])])}".rstrip()
         )
     print(f"{rows[0]['versions']}, {Path(model).name}")
-    return int(any(row.get("holds") is False or "property" not in row for row in rows))
+    verdicts = {row.get("holds") for row in rows}
+    return int(False in verdicts or True not in verdicts or "property" not in rows[-1])
 
 
 def _list() -> int:
-    for name, engine in _engines().items():
-        backend = engine()
-        reason = backend.unavailable_reason()
-        state = reason or "; ".join(f"{library} {version}" for library, version in backend.library_versions().items())
-        print(f"{name:<16}{printable(state)}")
+    for engine in table.engines():
+        if engine.is_outside:
+            backend = engine.plugin()
+            versions = "; ".join(f"{library} {version}" for library, version in backend.library_versions().items())
+            print(f"{engine.name:<16}{printable(backend.unavailable_reason() or versions)}")
     print(f"environments: {environments.folder()} (set by ${environments.FOLDER})")
     return 0

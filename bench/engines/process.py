@@ -92,15 +92,13 @@ class EngineModel:
         engine's process ends during the call, also in a second process.
         """
         with _lock:
-            try:
-                return self._call(name, arrays)
-            except CLOSED:
-                self._end()
-            try:
-                return self._call(name, arrays)
-            except CLOSED as error:
-                reason = self._end()
-                raise Crashed(f"the process of engine {self._name} ended twice during {name}: {reason}") from error
+            for _ in range(2):
+                try:
+                    return self._call(name, arrays)
+                except CLOSED:
+                    process = _running.pop(self._place, None)
+                    reason = process.end() if process is not None else "it did not start"
+            raise Crashed(f"the process of engine {self._name} ended twice during {name}: {reason}")
 
     def _call(self, name: str, arrays: tuple[np.ndarray, ...]) -> tuple[dict[str, Any], list[np.ndarray]]:
         if self._place not in _running:
@@ -113,10 +111,6 @@ class EngineModel:
             raise error(f"engine {self._name}: {printable(answer['error'])} ({answer['places']})")
         self.device, self.settings, self.build_s = (answer[key] for key in ("device", "settings", "build_s"))
         return answer, results
-
-    def _end(self) -> str:
-        process = _running.pop(self._place, None)
-        return process.end() if process is not None else "it did not start"
 
     @property
     def _place(self) -> tuple[str, str]:

@@ -28,24 +28,59 @@ GRADIENTS = "engine_gradients"
 """The experiment whose table is on the page too."""
 
 
-def write(names: Sequence[str], out: Path, settings: Sequence[str] = ()) -> Path:
+class Engine:
+    """A backend's engine: ``NAME``, or ``NAME==VERSION`` in an environment of another release."""
+
+    def __init__(self, word: str) -> None:
+        self.word, (self.name, _, self.release) = word, word.partition("==")
+        entry = registry.find("backends", self.name)
+        self.plugin: Any = entry.plugin
+        self.is_outside = self.plugin is not None and issubclass(self.plugin, EngineBackend)
+        """Whether the harness runs it in a Python of its own."""
+        self.is_here = not self.is_outside and not self.release
+        self.python = sys.executable if self.is_here else str(environments.python_of(word))
+        self.missing = entry.reason if self.is_here else self._missing()
+        """Why it cannot run, or empty."""
+
+    def _missing(self) -> str:
+        return environments.missing(self.word, None, getattr(self.plugin, "libraries", ())) or ""
+
+    def file(self, end: str) -> Path:
+        """Return the file ``NAME`` + ``end`` in the folder ``engines`` of the backend's engine, which may not exist."""
+        here = Path(inspect.getfile(self.plugin)).parents[1] / "engines"
+        return (self.plugin.files()[0].parent if self.is_outside else here) / f"{self.name}{end}"
+
+    def rows(self, script: ModuleType, *words: str) -> list[dict[str, Any]]:
+        """Return the rows of a script of the conformance set, run in this engine's Python.
+
+        If it cannot run, the run fails or takes longer than :data:`LIMIT_S`, the last row has the reason.
+        """
+        file = self.file("_conformance.py")
+        if self.missing or not file.exists():
+            return [{"reason": self.missing or f"no file {file.name}"}]
+        path = {} if self.is_outside else {"PYTHONPATH": str(Path(runner.__file__).parents[3])}
+        return run(self.python, script, str(file), *words, environment=os.environ | path)
+
+
+def engines() -> list[Engine]:
+    """Return all engines: backends in a Python of their own, and those with a file ``engines/NAME_conformance.py``."""
+    found = [Engine(name) for name, entry in registry.entries()["backends"].items() if entry.plugin is not None]
+    return [engine for engine in found if engine.is_outside or engine.file("_conformance.py").exists()]
+
+
+def write(names: Sequence[Engine], out: Path, settings: Sequence[str] = ()) -> Path:
     """Run the named engines, or all, write ``engines.csv`` and ``engines.md``, and return the page's path.
 
-    An engine runs the conformance set if there is a file ``engines/NAME_conformance.py`` beside the folder of its
-    backend. ``NAME==VERSION`` is the release of an environment by that name. Rows of other engines and of other versions,
-    which ``out`` has already, stay. ``settings`` are the experiment's, which has a folder per set of releases.
+    Rows of other engines and of other versions, which ``out`` has already, stay. ``settings`` are the experiment's, which
+    has a folder per set of releases.
     """
     rows: list[dict[str, Any]] = []
     backends: list[str] = []
-    for word in names or registry.entries()["backends"]:
-        name, _, release = word.partition("==")
-        plugin = registry.entries()["backends"][name].plugin
-        if plugin is None or not (issubclass(plugin, EngineBackend) or file_of(plugin, "_conformance.py").exists()):
-            continue
-        own, known = rows_of(word, runner), {"versions": "", "engine": name}
-        rows += [known | row | {"command": f"python -m bench engines table {word}"} for row in own]
-        if "case" in own[0] and (not release or issubclass(plugin, EngineBackend)):
-            backends.append(f"{name}[python={environments.python_of(word)}]" if release else name)
+    for engine in names or engines():
+        own, known = engine.rows(runner), {"versions": "", "engine": engine.name}
+        rows += [known | row | {"command": f"python -m bench engines table {engine.word}"} for row in own]
+        if "case" in own[0] and (engine.is_outside or not engine.release):
+            backends.append(f"{engine.name}[python={engine.python}]" if engine.release else engine.name)
     out.mkdir(parents=True, exist_ok=True)
     table, stored = pd.DataFrame(rows, columns=list(COLUMNS)), out / "engines.csv"
     releases = sorted({versions.partition(";")[0] for versions in table["versions"]} - {""})
@@ -66,35 +101,9 @@ def write(names: Sequence[str], out: Path, settings: Sequence[str] = ()) -> Path
     return page
 
 
-def file_of(plugin: Any, end: str) -> Path:
-    """Return the file ``engines/NAME`` + ``end`` beside the folder of a backend, which may not exist."""
-    return Path(inspect.getfile(plugin)).parents[1] / "engines" / f"{plugin.name}{end}"
-
-
 def read(file: Path) -> pd.DataFrame:
     """Return stored rows, all as text."""
     return pd.read_csv(file, dtype=str, keep_default_na=False)
-
-
-def rows_of(engine: str, script: ModuleType, *words: str) -> list[dict[str, Any]]:
-    """Return the rows of a script of the conformance set on ``NAME`` or ``NAME==VERSION``, run in that engine's Python.
-
-    If it cannot run, the run fails or takes longer than :data:`LIMIT_S`, the last row has the reason.
-    """
-    name, _, release = engine.partition("==")
-    entry, python, environment = registry.find("backends", name), str(environments.python_of(engine)), dict(os.environ)
-    assert entry.plugin is not None
-    is_inside = not issubclass(entry.plugin, EngineBackend)
-    if is_inside:
-        environment["PYTHONPATH"] = str(Path(runner.__file__).parents[3])
-    if is_inside and not release:
-        python, missing = sys.executable, entry.reason
-    else:
-        missing = environments.missing(engine, None, getattr(entry.plugin, "libraries", ())) or ""
-    file = file_of(entry.plugin, "_conformance.py")
-    if missing or not file.exists():
-        return [{"reason": missing or f"no file {file.name}"}]
-    return run(python, script, str(file), *words, environment=environment)
 
 
 def run(
@@ -104,12 +113,16 @@ def run(
     reason = ""
     with tempfile.TemporaryFile("w+") as output:
         try:
-            subprocess.run(
+            done = subprocess.run(
                 [python, str(script.__file__), *words],
-                env=environment, text=True, timeout=LIMIT_S, check=True, stdout=output, stderr=subprocess.PIPE,
+                env=environment, text=True, timeout=LIMIT_S, stdout=output, stderr=subprocess.PIPE,
             )  # fmt: skip
+            if done.returncode != runner.WRONG:
+                done.check_returncode()
         except (OSError, subprocess.SubprocessError) as error:
-            reason = f"{script.__name__.rpartition('.')[2]} stopped: {printable(error)[-80:]} {printable(getattr(error, 'stderr', ''))[-120:]}"
+            last = printable((getattr(error, "stderr", "") or "").strip().rpartition("\n")[2])
+            how = str(error).rpartition("]' ")[2]
+            reason = f"stopped: {how} {last[-200:]}".strip()
         output.seek(0)
         lines = [json.loads(line) for line in output if line.startswith("{")]
     versions = "; ".join(f"{library} {version}" for library, version in lines[0]["versions"].items()) if lines else ""

@@ -342,7 +342,7 @@ class Rollout(Program):
             return ""
         return (
             f"theta sets the initial state of scene {self.scene.name} while noise is on the actions, so that cost times "
-            "score is not the gradient"
+            "score is not the gradient: use noise=parameter"
         )
 
     @property

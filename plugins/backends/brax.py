@@ -17,6 +17,7 @@ class Brax(EngineBackend):
 
     name = "brax"
     file = "../engines/brax.py"
+    reads_mjcf = True
     damping_mode = "clipped"
     solver_error = 1e-6
     libraries = ("brax", "jax", "mujoco", "mujoco-mjx", "numpy")

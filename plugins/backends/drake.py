@@ -16,6 +16,7 @@ class Drake(EngineBackend):
 
     name = "drake"
     file = "../engines/drake.py"
+    reads_mjcf = True
     libraries = ("drake", "numpy")
     own_contact = True
 

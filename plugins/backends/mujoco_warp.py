@@ -12,6 +12,7 @@ class MujocoWarp(EngineBackend):
 
     name = "mujoco_warp"
     file = "../engines/mujoco_warp.py"
+    reads_mjcf = True
     damping_mode = "clipped"
     libraries = ("mujoco-warp", "warp-lang", "mujoco", "numpy")
     provides = frozenset({"value", "score", "physics"})

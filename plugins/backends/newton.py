@@ -32,8 +32,7 @@ class Newton(EngineBackend):
 
     def __post_init__(self) -> None:
         if self.solver == "xpbd":
-            for name, value in RIGID.items():
-                object.__setattr__(self, name, value)
+            vars(self).update(RIGID)
 
     def twin_refusal(self, program: Program, model: dict[str, Any]) -> str | None:
         """Return why the solver cannot run the twin: hinges or links; or None."""

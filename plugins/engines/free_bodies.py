@@ -1,8 +1,97 @@
-"""Cases of the conformance set for engines with motors and angular velocities of their own."""
+"""Cases of the conformance set by an engine's steps, for engines with motors and angular velocities of their own."""
 
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
+
+TINY = 1e-30
+"""Complex step, whose differences are exact to rounding."""
+
+
+class SteppedEngine:
+    """Steps of a model per case, and the adjoint through their derivatives.
+
+    ``build(case)`` returns a model with ``step`` and ``jacobians`` or ``pull`` of columns, as :mod:`bench.engines.server`
+    has it, and the forces of its motors. ``order_q`` and ``order_v`` are the places in a free body's MuJoCo coordinates of
+    the engine's; ``in_world``: whether its angular velocities are in the world's frame.
+    """
+
+    order_q, order_v, in_world = np.arange(7), np.arange(6), True
+
+    def __init__(self):
+        self.differs, self._built = {}, {}
+
+    def _path(self, case):
+        """Return the engine's states along the rollout."""
+        if case.name not in self._built:
+            self._built[case.name] = self.build(case)
+        model, arms = self._built[case.name]
+        path = [np.concatenate([case.qpos, self._turned(case, case.qpos, case.qvel)])[self._order(case)]]
+        for control in case.controls:
+            force = self._force(case, path[-1], arms @ control)
+            path.append(model.step(path[-1][:, None], force[:, None])[:, 0])
+        return path
+
+    def _order(self, case):
+        """Return the places in MuJoCo's states of the engine's."""
+        order, n_q = np.arange(case.qpos.size + case.qvel.size), case.qpos.size
+        for body, i in enumerate(case.data["quaternions"]):
+            order[i - 3 : i + 4] = i - 3 + self.order_q
+            order[n_q + 6 * body : n_q + 6 * body + 6] = n_q + 6 * body + self.order_v
+        return order
+
+    def _turned(self, case, q, v, sign=1):
+        """Return velocities or forces in the engine's frames, or with sign -1 in MuJoCo's."""
+        v = v + 0 * q[0]
+        for body, i in enumerate(case.data["quaternions"] if self.in_world else ()):
+            rates, axis = slice(6 * body + 3, 6 * body + 6), sign * q[i + 1 : i + 4]
+            across = np.cross(axis, v[rates])
+            v[rates] += 2 * (q[i] * across + np.cross(axis, across))
+        return v
+
+    def _force(self, case, x, force):
+        """Return the engine's force at one of its states."""
+        order, n_q = self._order(case), case.qpos.size
+        return self._turned(case, x[np.argsort(order)][:n_q], force)[order[n_q:] - n_q]
+
+    def _cost(self, case, x):
+        q, v = np.split(x[np.argsort(self._order(case))], [case.qpos.size])
+        return case.cost(q, self._turned(case, q, v, -1))
+
+    def rollout(self, case):
+        """Return the cost of a case."""
+        return float(self._cost(case, self._path(case)[-1]))
+
+    def gradient(self, case):
+        """Return the derivatives by state and controls."""
+        *path, end = self._path(case)
+        slope, by_control = _slope(lambda x: self._cost(case, x), end), []
+        for x, control in zip(path[::-1], case.controls[::-1], strict=True):
+            slope, by_u = self._pulled(case, x, control, slope)
+            by_control.insert(0, by_u)
+        by_q, by_v = np.split(slope[np.argsort(self._order(case))], [case.qpos.size])
+        by_q = by_q + _slope(lambda q: by_v @ self._turned(case, q, case.qvel), case.qpos)
+        by_v = _slope(lambda v: by_v @ self._turned(case, case.qpos, v), case.qvel)
+        return {"qpos": by_q, "qvel": by_v, "controls": np.array(by_control)}
+
+    def _pulled(self, case, x, control, slope):
+        """Return the derivatives by state and control of the sum of slope times the next state."""
+        (model, arms), inputs = self._built[case.name], np.append(x, control)
+
+        def force(inputs):
+            return self._force(case, inputs[: x.size], arms @ inputs[x.size :])
+
+        at = x[:, None], force(inputs)[:, None]
+        if hasattr(model, "pull"):
+            by_x, by_force = (part[:, 0] for part in model.pull(*at, slope[:, None]))
+        else:
+            by_x, by_force = (slope @ part[..., 0] for part in model.jacobians(*at))
+        through = _slope(lambda inputs: by_force @ force(inputs), inputs)
+        return by_x + through[: x.size], through[x.size :]
+
+
+def _slope(function, x):
+    return np.array([function(x + step).imag for step in 1j * TINY * np.eye(len(x))]) / TINY
 
 
 def without_motors(case):
@@ -29,13 +118,3 @@ def without_motors(case):
 def differing(root, reasons):
     """Return the reasons whose paths find an element in the MJCF, as text."""
     return "; ".join(dict.fromkeys(reason for path, reason in reasons.items() if root.find(f".//{path}") is not None))
-
-
-def in_world(case, q, v, sign=1):
-    """Return v with angular velocities of free bodies in the world's frame, or with sign -1 in the bodies' frames again."""
-    v = v.copy()
-    for body, i in enumerate(case.data["quaternions"]):
-        rates, axis = slice(6 * body + 3, 6 * body + 6), sign * q[i + 1 : i + 4]
-        across = np.cross(axis, v[rates])
-        v[rates] = v[rates] + 2 * (q[i] * across + np.cross(axis, across))
-    return v

@@ -26,6 +26,18 @@ def on_device(model: Any) -> tuple[Any, Any]:
     return mjx.put_model(model), data
 
 
+def rolled(model: Any, data: Any, q: Any, v: Any, controls: Any) -> Any:
+    """Return the last state of a rollout. Warm starts of the solver have no derivative."""
+
+    def step(data: Any, u: Any) -> Any:
+        after = mjx.step(model, data.replace(ctrl=u))
+        after = after.replace(qacc_warmstart=jax.lax.stop_gradient(after.qacc_warmstart))
+        return jax.tree.map(lambda new, old: new.astype(old.dtype), after, data), None
+
+    end, _ = jax.lax.scan(step, data.replace(qpos=q, qvel=v), controls)
+    return end.qpos, end.qvel
+
+
 class Model(mujoco_conformance.Model):
     """A model from MJCF text, compiled when it is first called. Gaps and loops are those of the C engine's geometry."""
 
@@ -35,15 +47,7 @@ class Model(mujoco_conformance.Model):
         super().__init__(mjcf)
         self.remarks = mjx_remarks(self.model)
         model, data = on_device(self.model)
-
-        def rollout(q: Any, v: Any, controls: Any) -> Any:
-            def going(data: Any, u: Any) -> Any:
-                after = mjx.step(model, data.replace(ctrl=u))
-                return jax.tree.map(lambda new, old: new.astype(old.dtype), after, data), None
-
-            end, _ = jax.lax.scan(going, data.replace(qpos=q, qvel=v), controls)
-            return end.qpos, end.qvel
-
+        rollout = functools.partial(rolled, model, data)
         self._forward = jax.jit(lambda q, v, u: mjx.forward(model, data.replace(qpos=q, qvel=v, ctrl=u)))
         self._rollout, self._rollouts = jax.jit(rollout), jax.jit(jax.vmap(rollout))
 
@@ -90,14 +94,8 @@ class Engine:
 
         def cost(q: Any, v: Any, controls: Any, parameter: Any) -> Any:
             own = model.tree_replace({name: old.at[index].set(parameter)})
-
-            def step(at: Any, u: Any) -> Any:
-                with self._solver():
-                    after = mjx.step(own, data.replace(qpos=at[0], qvel=at[1], ctrl=u, qacc_warmstart=at[2]))
-                return (after.qpos, after.qvel, jax.lax.stop_gradient(after.qacc)), None
-
-            (q, v, _), _ = jax.lax.scan(step, (q, v, 0.0 * v), controls)
-            return case.cost(q, v)
+            with self._solver():
+                return case.cost(*rolled(own, data, q, v, controls))
 
         return jax.jit(jax.value_and_grad(cost, (0, 1, 2, 3)))
 

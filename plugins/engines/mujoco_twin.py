@@ -4,18 +4,14 @@ import xml.etree.ElementTree as ElementTree
 
 import mujoco
 import numpy as np
+from twin_bodies import bodies
 
 
 def mujoco_model(program):
     """Return the twin as a MuJoCo model, with a motor of gear 1 per joint in place of its motors, springs and dampers."""
-    root = ElementTree.fromstring(f'<mujoco><option gravity="0 0 0"/>{program["mjcf"]}</mujoco>')
-    for tag in ("actuator", "tendon"):
-        for node in root.findall(tag):
-            root.remove(node)
+    root = bodies(program)
     motors = ElementTree.SubElement(root, "actuator")
     for joint in root.iter("joint"):
-        joint.attrib.pop("damping", None)
-        joint.attrib.pop("stiffness", None)
         ElementTree.SubElement(motors, "motor", joint=joint.get("name"))
     if root.find(".//geom") is None:  # Brax's validation fails without any
         ElementTree.SubElement(root.find("worldbody"), "geom", size="0.1", contype="0", conaffinity="0")
@@ -23,10 +19,10 @@ def mujoco_model(program):
     model.opt.timestep = program["dt"]
     if model.npair:
         law, impedance = program["contact"], program["backend"]["impedance"]
-        bodies = model.geom_bodyid[np.stack([model.pair_geom1, model.pair_geom2])]
+        pairs = model.geom_bodyid[np.stack([model.pair_geom1, model.pair_geom2])]
         friction = model.pair_friction[:, 0]
         # a contact is four edges of a friction pyramid, which together push with 2 / (mu^2 (1 + mu^2)) times one spring
-        inverse_mass = model.body_invweight0[bodies, 0].sum(axis=0) * friction**2 * (1 + friction**2) / 2
+        inverse_mass = model.body_invweight0[pairs, 0].sum(axis=0) * friction**2 * (1 + friction**2) / 2
         model.pair_solref[:] = -np.array([law["stiffness"], law["damping"]]) * inverse_mass[:, None]
         model.pair_solimp[:, :2] = impedance
     return model

@@ -54,6 +54,10 @@ class Worlds:
         tape = self._run(x, u)
         return [self._back(tape, slope) for slope in slopes]
 
+    def pull(self, x, u, slope):
+        """Return the derivatives of the sum of slope times the next states."""
+        return self.pulls(x, u, [slope])[0]
+
     def _back(self, tape, slope):
         tape.zero()
         after = zip(self._arrays(self._after), np.split(slope, [self._n_q]), strict=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -109,7 +108,7 @@ class Engines(StudyPackage):
         status = {"status": "ok", "reason": "computes no gradients"}
         result |= {
             "reference_method": truth.method, "reference_spacing": truth.spacing, "device": problem.device,
-            "zeroth_rmse_rel": zeroth.get("rmse_rel", math.nan),
+            "zeroth_rmse_rel": zeroth.get("rmse_rel"),
         }  # fmt: skip
         if has_gradient:
             _, gradient, difference, step = difference_check(problem)
@@ -121,16 +120,17 @@ class Engines(StudyPackage):
                 "program_error_rel": relative_error(gradient, difference),
                 "difference_step": step,
                 "nan_share": float(1.0 - np.isfinite(gradients).all(axis=0).mean()),
-                **_model_error(cell, session, gradient), **{name: first.get(name, math.nan) for name in SUMMARY},
+                **_model_error(cell, session, gradient), **{name: first.get(name) for name in SUMMARY},
             }  # fmt: skip
             status = finite_status("some gradients are not finite", gradients, gradient)
             status["reason"] = "; ".join(filter(None, (status["reason"], first["reason"])))
         if not truth.is_finite:
             status = {name: zeroth[name] for name in status}
+        result["memory_mb"] = timing.peak_memory_mb()
         if isinstance(problem, EngineProblem):
+            result["memory_mb"] = problem.peak_memory_mb
             result["engine_settings"] = ";".join(f"{name}={value}" for name, value in problem.settings.items())
-        memory = problem.peak_memory_mb if isinstance(problem, EngineProblem) else timing.peak_memory_mb()
-        return status | result | {"memory_mb": memory}
+        return status | result
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
         """Return the table with a line per scene and engine, and the grid of usable gradients."""
@@ -166,24 +166,23 @@ def _times(cell: Cell, problem: Problem, study: Engines, has_gradient: bool) -> 
     """Return the times of first and later calls, and the shares of a gradient's time outside the engine."""
     theta, n_noise = problem.program.theta0, problem.program.n_noise
     w = noise.shared(cell.seed, cell.scene.name, 1, study.batch, n_noise)[0].T
-    functions: dict[str, Callable[..., np.ndarray]] = {"value_s": problem.value}
-    if has_gradient:
-        functions["gradient_s"] = problem.grad
+    functions = {"value_s": problem.value} | ({"gradient_s": problem.grad} if has_gradient else {})
     started = time.perf_counter()
     for function in functions.values():
         function(theta, w)
     result = {"first_s": time.perf_counter() - started}
+
+    def clocks() -> np.ndarray:
+        return np.array([time.perf_counter(), *(getattr(problem, name, math.nan) for name in ("engine_s", "pipe_s"))])
+
     for name, function in functions.items():
-        if isinstance(problem, EngineProblem):
-            engine, pipe = problem.engine_s, problem.pipe_s
-        started = time.perf_counter()
+        before = clocks()
         _, clock = timing.timed(lambda _, function=function: function(theta, w), study.timed_calls)  # type: ignore[misc]
-        elapsed = time.perf_counter() - started
+        elapsed, engine, pipe = clocks() - before
         result[name] = clock.median_s
-        if name == "gradient_s" and isinstance(problem, EngineProblem):
-            engine, pipe = problem.engine_s - engine, problem.pipe_s - pipe
-            result |= {"pipe_share": pipe / elapsed, "pass_share": 1.0 - (engine + pipe) / elapsed}
-    return result
+    return result | (
+        {"pipe_share": pipe / elapsed, "pass_share": 1.0 - (engine + pipe) / elapsed} if has_gradient else {}
+    )
 
 
 # ------------------------------------------------------------------------------------------------- what is shown

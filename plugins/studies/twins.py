@@ -14,10 +14,11 @@ import numpy as np
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, exact, numbers, seconds, text
 from bench.experiment.experiment import Experiment
+from bench.experiment.reference_backends import capable_backends
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Mark, Views
 from bench.measure import timing
-from bench.model import Unsupported, param, rollout
+from bench.model import Unsupported, param
 
 from . import StudyPackage, finite_status, first_batch, gradient_seconds, norm, relative_error
 
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 FLOOR = 1e-17
 """Smallest difference that is drawn; smaller ones, 0 included, are drawn here as upper limits."""
+PARTED = 1e-6
+"""Relative difference of states from which on two engines have parted."""
 DIFFERENCES = ("gradient_difference_rel", "state_difference_rel", "cost_difference_rel")
 SHOWN = (
     "state_difference", "state_difference_rel", "cost_difference_rel", "gradient_difference_rel", "gradient_cosine",
@@ -71,27 +74,27 @@ class Twins(StudyPackage):
         """Return one cell's results by column: differences at w = 0, and times of costs and gradients [s].
 
         ``state_difference`` is the largest difference over time and coordinates, in the units of the coordinate.
-        ``state_difference_rel`` is in units of the coordinate's largest value. Raises :class:`Unsupported` if the backend
-        has no twin, or the scene no program of its own.
+        ``state_difference_rel`` is in units of the coordinate's largest value. Two engines are compared where the scene has
+        no program of its own; ``reason`` has the step in which they part. Raises :class:`Unsupported` if the backend has no
+        twin.
         """
-        scene = rollout(cell.program()).scene
         if "physics" not in cell.backend.provides:
             raise Unsupported(f"backend {cell.backend.name} has no twin to compare: its steps are the scene's own")
-        if not cell.ranked_backends:
-            raise Unsupported(
-                f"scene {scene.name} exists only as an engine's model: it has no program of its own to compare with"
-            )
-        twin, own = session.problem(cell), session.problems.of(cell.ranked_backends[0], cell)
+        other = (cell.ranked_backends or capable_backends(cell.program()))[0]
+        twin, own = session.problem(cell), session.problems.of(other, cell)
         theta, still = twin.program.theta0, np.zeros((twin.program.n_noise, 1))
         path, own_path = (problem.trajectory(theta, still).states[:, :, 0] for problem in (twin, own))
         gradient, own_gradient = (problem.grad(theta, still)[:, 0] for problem in (twin, own))
         cost, own_cost = (float(problem.value(theta, still)[0]) for problem in (twin, own))
-        difference, w = np.abs(path - own_path).max(axis=0), first_batch(cell, len(still))
+        differences, w = np.abs(path - own_path), first_batch(cell, len(still))
+        relative = (differences / np.maximum(np.abs(own_path).max(axis=0), 1e-300)).max(axis=1)
+        has_parted = not cell.ranked_backends and relative.max() > PARTED
         return {
             **finite_status("the engine's rollout or its gradient is not finite", path, gradient),
-            "own_backend": cell.ranked_backends[0].name,
-            "state_difference": float(difference.max()),
-            "state_difference_rel": float((difference / np.maximum(np.abs(own_path).max(axis=0), 1e-300)).max()),
+            **({"reason": f"the engines part in step {np.argmax(relative > PARTED)}"} if has_parted else {}),
+            "own_backend": other.name,
+            "state_difference": float(differences.max()),
+            "state_difference_rel": float(relative.max()),
             "cost": cost, "own_cost": own_cost, "cost_difference_rel": abs(cost - own_cost) / abs(own_cost),
             "gradient": gradient.tolist(), "own_gradient": own_gradient.tolist(),
             "gradient_norm": norm(gradient), "own_gradient_norm": norm(own_gradient),
@@ -109,7 +112,7 @@ class Twins(StudyPackage):
         shown = Shown(experiment, rows)
         cells = shown.cells(SHOWN, "engines compared with the scenes' own programs", NOTES)
         worst = shown.good.groupby("problem")["gradient_difference_rel"].transform("max")
-        frame = shown.good.loc[worst.sort_values(ascending=False, kind="stable").index]
+        frame = shown.good.loc[(-worst).sort_values(kind="stable").index]
         chart = Chart(
             "twins", frame, [shown.column(name, least=FLOOR, log=True, label=self.columns.by_name[name].doc) for name in DIFFERENCES],
             [text("problem", label="")], "dots", series="method", marks=[Mark("rounding up to here", 1e-6)], height=0.3,

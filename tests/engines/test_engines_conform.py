@@ -58,6 +58,6 @@ def test_balls_of_a_tenth_of_a_kilogram_touch_in_brax():
 def test_a_slide_on_a_hinge_is_right_except_in_brax(name):
     """Its axis does not turn in Brax: were it repaired, the documentation would be wrong."""
     assert installed(name)
-    rows = table.rows_of(name, runner, "offset_slide")
+    rows = table.Engine(name).rows(runner, "offset_slide")
     assert [row["case"] for row in rows] == ["offset_slide"] * (1 if name == "mujoco_warp" else 4)
     assert {row["is_right"] for row in rows} == {name != "brax"}

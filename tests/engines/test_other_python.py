@@ -7,12 +7,24 @@ import shutil
 import signal
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
-from classes import BounceOnce, BouncingBall, Cartpole, Hopper, Impulse, Numpy, Penalty, Pushing, Rk4, SemiImplicitEuler
+from classes import (
+    BounceOnce,
+    BouncingBall,
+    Cartpole,
+    Hopper,
+    Impulse,
+    Numpy,
+    Penalty,
+    Pushing,
+    Rk4,
+    SemiImplicitEuler,
+)
 
 import bench
 from bench.cli import main
@@ -26,6 +38,7 @@ from bench.experiment import by_name
 from bench.experiment.keys import fingerprint
 from bench.model import Problem, compose, registry
 
+pytest.importorskip("mujoco", reason="reads twins")
 TOYS = Path(__file__).parent / "toys"
 HERE = sys.executable
 PATHS = [str(TOYS.parent), str(TOYS.parents[1])]  # of this file and of `classes`, for a run of its own
@@ -250,7 +263,9 @@ def test_versions_of_the_other_python_are_in_the_row(tmp_path):
     assert main([*words, f"results_dir={tmp_path}"]) == 0
     (versions,) = bench.load(tmp_path / "versions")["versions"]
     python = ".".join(map(str, sys.version_info[:3]))
-    assert versions == f"numpy={np.__version__};toy:python={python};toy:numpy={np.__version__}"
+    assert (
+        versions == f"numpy={np.__version__};mujoco={version('mujoco')};toy:python={python};toy:numpy={np.__version__}"
+    )
 
 
 def test_the_command_lists_engines_and_installs_requirements(tmp_path, monkeypatch, capsys):
@@ -343,6 +358,8 @@ class Leaning(BounceOnce):
     ("engine", "scene", "law", "reason"),
     [
         ("taichi", Cartpole(), Penalty, "slides only"),
+        ("taichi", by_name.make("scenes", "wall_penalty_1d"), Penalty(damping=0.0), "taichi's ground is z = 0"),
+        ("drake", by_name.make("scenes", "wall_penalty_1d"), Penalty, None),
         ("newton", Cartpole(), Penalty, None),
         ("newton", BouncingBall(), Penalty(damping=1.0), "supports damping_mode=approach only, not clipped"),
         ("newton[solver=semi_implicit]", Cartpole(), Penalty, "semi_implicit solver has no joint coordinates"),

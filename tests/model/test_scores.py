@@ -53,7 +53,7 @@ TRUTH = 1.4
 """grad J of ``Gusts``: T = 1 s and v_0 = 1.7 m/s."""
 ROUNDED = 1e-6
 """Error of the numpy backend's central differences."""
-REASON = "theta sets the initial state of scene {} while noise is on the actions, so that cost times score is not the gradient"
+REASON = "theta sets the initial state of scene {} while noise is on the actions, so that cost times score is not the gradient: use noise=parameter"
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from bench.plugins.studies.stability import cells_of
 from bench.plugins.studies.twins import FLOOR
 from helpers import unmeasured
 
+import bench
 from bench.experiment import config
 from bench.experiment.axes import table
 from bench.experiment.columns import COMMON
@@ -157,6 +158,13 @@ def test_twins_of_a_swept_scene_are_panels_of_their_own():
     assert chart.x[0].least == FLOOR, "0 is at the lower edge"
     assert list(readable(lines)["horizon [steps]"]) == ["2", "2", "3", "3"]
     assert list(table(given, rows))[-2:] == ["study", "parameters"]
+
+
+def test_two_engines_on_a_robot_part_in_a_step(tmp_path):
+    robot = "mjcf[file=cube.xml,theta=velocity,noise=parameter]"
+    words = {"contacts": ["penalty"], "backends": ["mujoco[cone=elliptic]"], "estimators": ["plain"], "samples": 2}
+    row = bench.run(study="twins", name="own", scenes=[robot], results_dir=tmp_path, workers=0, **words).iloc[0]
+    assert row["reason"].startswith("the engines part in step ")
 
 
 # ------------------------------------------------------------------------------------------------------ swept axes

@@ -13,7 +13,6 @@ import copy
 import functools
 import itertools
 import json
-import runpy
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
@@ -256,13 +255,13 @@ def check(
     ``holds`` is None where a property was not checked, with the reason. ``step`` and ``state`` are of the first state that breaks
     it, ``worst`` is the largest difference in all states; then the reason has the model's remarks.
     """
-    make = functools.cache(make)
+    subject = Subject(functools.cache(make), path, steps, seed)
     for name in names or PROPERTIES:
         tolerance, differences, method = PROPERTIES[name]
         row: dict[str, Any] = {"property": name, "holds": None, "worst": None, "tolerance": tolerance, "states": 0}
         row |= {"step": None, "state": None, "reason": ""}
+        subject.random = np.random.default_rng([seed, 1])
         try:
-            subject = Subject(make, path, steps, seed)
             if method and not getattr(subject.model, method, None):
                 raise NotImplementedError(f"Model has no {METHODS[method]}")
             found = list(differences(subject))
@@ -308,17 +307,16 @@ def _layout(root: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 def main(engine: str, path: str, *words: str) -> None:
     """Print the rows of the class ``Model`` of a file as JSON, a row a line: ``[PROPERTY ...] [steps=60] [seed=0]``."""
-    sys.path.append(str(Path(engine).parent))
-    module = runpy.run_path(engine)
-    if "Model" not in module:
-        sys.exit(f"{engine} has no class Model")
+    module, names = runner.load(engine, "Model"), [word for word in words if word in PROPERTIES]
     print(json.dumps({"versions": module.get("VERSIONS", {})}))
-    numbers: dict[str, Any] = {
-        name: int(value) for name, _, value in (word.partition("=") for word in words if word not in PROPERTIES)
-    }
-    for row in check(module["Model"], path, *(word for word in words if word in PROPERTIES), **numbers):
+    settings = (word.partition("=") for word in words if word not in PROPERTIES)
+    numbers: dict[str, Any] = {name: int(value) for name, _, value in settings}
+    found = set()
+    for row in check(module["Model"], path, *names, **numbers):
         print(json.dumps(row), flush=True)
+        found.add(row["holds"])
+    sys.exit(runner.WRONG * (False in found or True not in found))
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main(*sys.argv[1:]) if sys.argv[2:] else sys.exit(__doc__)

@@ -25,8 +25,12 @@ UNCERTAIN = 0.01
 """Largest such margin, relative to the derivative, at which it is right. At any margin it is wrong if it is off by more."""
 EXPLAINED = 0.1
 """Largest distance to a fault's numbers, as a share of the distance to the right ones, at which an engine has the fault."""
+RELATED = 0.01
+"""Largest distance to changed right numbers, as a share of the error and of the wrong numbers, that explains a derivative."""
 TOLERANCES = {"float64": 1e-6, "float32": 1e-3}
 """Relative tolerances by name. A penetration of 0.1 mm, 1 m from the origin, has 3 digits in float32."""
+WRONG = 10
+"""Exit status of a script that ran and found something wrong, or judged nothing."""
 COLUMNS = (
     "case", "term", "is_right", "digits", "ratio", "component", "expected", "obtained", "uncertainty", "looks_like",
     "against", "seconds", "reason",
@@ -152,60 +156,59 @@ def _verdict(engine: Any, case: Case, term: str, found: Any, differs: str) -> di
         faults = others = {}
     if result.size != expected.size:
         return {"is_right": False, "reason": f"{result.size} numbers instead of {expected.size}"}
-    tolerance = getattr(engine, "tolerance", "float64")
-    error, scale, margin = (
-        np.abs(result - expected),
-        np.abs(expected).max(initial=1e-9),
-        DOUBTS * (doubt + 0.0 * expected),
-    )
-    is_off = error > TOLERANCES.get(tolerance, tolerance) * scale + margin
-    off, worst = error.max(), int(np.where(is_off.any(), error * is_off, error).argmax())
-    is_known, is_wrong = bool(np.isfinite(expected).all()), not np.isfinite(result).all() or bool(is_off.any())
-    is_right = False if is_wrong else True if is_known and margin.max() <= UNCERTAIN * scale else None
+    if strange := result.size - int(np.isfinite(result).sum()):
+        return {"is_right": False, "reason": f"{strange} of {result.size} numbers not finite"}
+    if not np.isfinite(expected).all():
+        return {"is_right": None, "reason": "own differences are not finite"}
+    tolerance, scale = getattr(engine, "tolerance", "float64"), np.abs(expected).max(initial=1e-9)
+    error, margin = np.abs(result - expected), DOUBTS * (doubt + 0.0 * expected)
+    limit = TOLERANCES.get(tolerance, tolerance) * scale + margin
+    off, is_off = error.max(), error > limit
+    worst = int(np.where(is_off.any(), error * is_off, error).argmax())
     near = [name for name, by in faults.items() if np.abs(result - by.get(term, np.inf)).max() <= EXPLAINED * off]
-    ratio = result @ expected / (expected @ expected) if expected.any() else np.nan
     numbers = {
-        "ratio": ratio,
+        "ratio": result @ expected / (expected @ expected) if expected.any() else np.nan,
         "expected": expected[worst],
         "obtained": result[worst],
         "uncertainty": margin[worst] / DOUBTS,
     }
-    return {
-        "is_right": is_right,
-        "digits": round(float(-np.log10(max(off / scale, 1e-16))), 1) if np.isfinite(off) else None,
+    row = {
+        "is_right": True if margin.max() <= UNCERTAIN * scale else None,
+        "digits": round(float(-np.log10(max(off / scale, 1e-16))), 1),
         **{name: float(f"{number:.12g}") if np.isfinite(number) else None for name, number in numbers.items()},
         "component": worst,
-        "looks_like": " or ".join(near) if is_wrong else "",
-        **({} if is_known else {"reason": "own differences are not finite"}),
-        **({"reason": _explained(term, result, expected, is_off, others)} if is_wrong else {}),
     }
+    if not is_off.any():
+        return row
+    n_rows = len(case.controls) if term == "controls" else result.size
+    reason = _explained(term, result, expected, limit, others, n_rows)
+    return row | {"is_right": False, "looks_like": " or ".join(near), "reason": reason}
 
 
 def _explained(
-    term: str, result: np.ndarray, expected: np.ndarray, is_off: np.ndarray, others: dict[str, np.ndarray]
+    term: str, result: np.ndarray, right: np.ndarray, limit: np.ndarray, others: dict[str, np.ndarray], n_rows: int
 ) -> str:
-    """Return how wrong numbers are related to the right ones: a factor, other numbers of the case, or an order of their own."""
-    if strange := result.size - int(np.isfinite(result).sum()):
-        return f"{strange} of {result.size} numbers not finite"
-    part: Any = ...
-    where = ""
-    if 0 < is_off.sum() < is_off.size:
-        is_few = 2 * is_off.sum() <= is_off.size
-        part, where = is_off, f"{'' if is_few else ' except '}{np.flatnonzero(is_off == is_few).tolist()}"
-    for own, place in ((..., ""), (part, where)):
-        found, right = result[own], expected[own]
-        factor = found @ right / max(right @ right, 1e-300)
-        guesses = {f"{factor:.7g} times" if found.any() else "0": factor * right}
-        if not place and found.size > 1:
-            same = {f"the numbers of {other}": number for other, number in others.items() if number.size == found.size}
-            guesses |= same | {"in reverse order": right[::-1]}
-            guesses |= {f"shifted by {step:+d}": np.roll(right, step) for step in (1, -1) if found.size > 2}
-        for guess, numbers in guesses.items():
-            inner = slice(1, -1) if guess.startswith("shifted") else ...
-            if np.abs(found - numbers)[inner].max() <= EXPLAINED * np.abs(found - right)[inner].max():
-                return f"{term}{place}: {guess}" if place else guess
-    worst = (np.abs(result - expected) * is_off).argmax()
-    return f"{term}{where or [int(worst)]}: {result[worst]:.6g} instead of {expected[worst]:.6g}"
+    """Return how wrong numbers are related to the right ones: a factor, other numbers of the case, or another order."""
+    error = np.abs(result - right)
+    is_off, rows = error > limit, right.reshape(n_rows, -1)
+    worst, few = int((error * is_off).argmax()), 2 * is_off.sum() <= is_off.size
+    where = f"{term}{'' if few else ' except '}{np.flatnonzero(is_off == few).tolist()}"
+    guesses = {"0": 0 * right} | {f"the numbers of {other}": by for other, by in others.items()}
+    for place, own in (("", is_off | True), (f"{where}: ", is_off)):
+        factor = result[own] @ right[own] / max(right[own] @ right[own], 1e-300)
+        guesses[f"{place}{factor:.7g} times" if factor else f"{place}0"] = np.where(own, factor * right, right)
+    for step, outer in ((1, 0), (-1, -1)) if n_rows > 2 else ():
+        shifted = np.roll(rows, step, 0)
+        shifted[outer] = result.reshape(rows.shape)[outer]
+        guesses[f"shifted by {step:+d}"] = shifted.ravel()
+    order = np.argsort(right)[np.argsort(np.argsort(result))]
+    guesses[f"in the order {order.tolist()}"] = right[order]
+    allowed = limit + RELATED * min(error.max(), np.abs(result[is_off]).max())
+    for guess, numbers in guesses.items():
+        if numbers.size == result.size and (np.abs(result - numbers) <= allowed).all():
+            return guess
+    where = f"{term}[{worst}]" if is_off.all() else where
+    return f"{where}: {result[worst]:.6g} instead of {right[worst]:.6g}"
 
 
 def run(engine: Any, *names: str) -> list[dict[str, Any]]:
@@ -216,10 +219,24 @@ def run(engine: Any, *names: str) -> list[dict[str, Any]]:
 def verify(rows: list[dict[str, Any]], judged: int = 1) -> None:
     """Raise :class:`AssertionError` if a row is wrong, or if fewer than ``judged`` derivatives are right or wrong."""
     texts = [f"{row['case']} {row['term']}: {row['reason']}" for row in rows if row["is_right"] is False]
+    if text := "\n".join(filter(None, [*texts, too_few(rows, judged)])):
+        raise AssertionError(text)
+
+
+def too_few(rows: list[dict[str, Any]], judged: int) -> str:
+    """Return how many derivatives are right or wrong if these are fewer than ``judged``, otherwise nothing."""
     number = sum(row["is_right"] is not None and row["term"] in TERMS for row in rows)
-    texts += [f"{number} derivatives are judged, {judged} are required"] * (number < judged)
-    if texts:
-        raise AssertionError("\n".join(texts))
+    return f"{number} derivatives are judged, {judged} are required" if number < judged else ""
+
+
+def load(path: str, name: str) -> dict[str, Any]:
+    """Return what a file defines. Ends this process if the file does not exist or has no class ``name``."""
+    sys.path.append(str(Path(path).parent))  # last: a file may have the name of a library
+    try:
+        module = runpy.run_path(path)
+    except OSError as error:
+        sys.exit(f"{path}: {error.strerror}")
+    return module if name in module else sys.exit(f"{path} has no class {name}")
 
 
 def main(path: str, *names: str) -> None:
@@ -228,13 +245,17 @@ def main(path: str, *names: str) -> None:
         own = cases(*names)
     except ValueError as error:
         sys.exit(str(error))
-    sys.path.append(str(Path(path).parent))  # last: a file may have the name of a library
-    engine = runpy.run_path(path)["Engine"]()
+    engine, rows = load(path, "Engine")["Engine"](), []
     print(json.dumps({"versions": getattr(engine, "versions", {})}))
-    for case in own:
-        for row in check(engine, case):
-            print(json.dumps(row), flush=True)
+    for row in (row for case in own for row in check(engine, case)):
+        rows.append(row)
+        print(json.dumps(row), flush=True)
+    try:
+        verify(rows)
+    except AssertionError as error:
+        print(error, file=sys.stderr)
+        sys.exit(WRONG)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main(*sys.argv[1:]) if sys.argv[1:] else sys.exit(__doc__)
