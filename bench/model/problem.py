@@ -157,7 +157,7 @@ class Problem(ABC):
 
     def fit_blocks(self, column_bytes: int) -> None:
         """Set the block size so that a block fills half of a core's cache, at ``column_bytes`` per rollout."""
-        self.block, self.threads = blocks.columns_in_cache(column_bytes, self.grain), blocks.cores()
+        self.block, self.threads = blocks.columns_in_cache(column_bytes), blocks.cores()
 
     @property
     def sigma(self) -> float:
