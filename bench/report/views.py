@@ -144,7 +144,7 @@ def estimator_curves(rows: pd.DataFrame, close: float | None = CLOSE) -> pd.Data
             margin = close * np.fmax(*np.abs([x, y]))[:, [0, 1, 2, 2]]
             return bool(((x == y) | (np.isnan(x) & np.isnan(y)) | (np.abs(x - y) <= margin)).all())
 
-    curves = []
+    curves: list[tuple[Any, ...]] = []
     for label, names in rows.groupby("label", sort=False)["run"].unique().items():
         runs = {name: places[label, name].to_numpy() for name in names}
         while runs:
