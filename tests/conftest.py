@@ -72,7 +72,7 @@ def one_width():
     """Pad small batches to one width, so that JAX compiles each function of a program once; padding changes no digit."""
     from bench.plugins.backends.jax import JaxProblem
 
-    JaxProblem.fine = JaxProblem.grain
+    JaxProblem.grain = 128
 
 
 @pytest.fixture(autouse=True)

@@ -42,7 +42,7 @@ class ProcessState:
 
     def follow(self) -> None:
         """Limit the threads of the libraries that have been imported since."""
-        new = set(LIBRARIES) & sys.modules.keys() - self._limited
+        new = (set(LIBRARIES) - self._limited) & sys.modules.keys()
         if new and self._single_thread:
             self._ends.enter_context(threadpool_limits(1))
         self._limited |= new

@@ -18,25 +18,32 @@ BITS = 30
 """Binary digits of a coordinate of a Sobol point."""
 HELD = 1 << 22
 """Most normal numbers that a cell stores in memory (32 MiB). A cell that needs more draws them in parts."""
+KEPT = 4 * HELD
+"""Most normal numbers that are kept for cells and references with the same noise."""
+
+_kept: dict[tuple[object, ...], np.ndarray] = {}
 
 
-def shared(seed: int, scene: str, repeats: int, samples: int, width: int, design: Design = IID) -> np.ndarray:
-    """Return the noise of cells, see :func:`draw`, in an array of the caller's own.
+def shared(
+    seed: int, scene: str, repeats: int, samples: int, width: int, design: Design = IID, stream: str = "cells"
+) -> np.ndarray:
+    """Return the noise of :func:`draw` in an array of the caller's own.
 
-    Up to :data:`HELD` numbers are kept for the next cell with the same arguments, which gets a copy: read-only does not
-    bind torch, and a cell that writes into its noise changes no other cell.
+    It is kept for the next call with the same arguments, which gets a copy: read-only does not bind torch, and a cell that
+    writes into its noise changes no other cell. The oldest noise makes room, and noise beyond :data:`HELD` is not kept.
     """
-    if repeats * samples * width > HELD:
-        return draw(seed, scene, repeats, samples, width, "cells", design)
-    own = _kept(seed, scene, repeats, samples, width, design).copy(order="K")
+    given = (seed, scene, repeats, samples, width, stream, design)
+    block = _kept.pop(given, None)
+    if block is None:
+        block = draw(*given)
+        if block.size > HELD:
+            return block
+        while sum(kept.size for kept in _kept.values()) > KEPT - block.size:
+            del _kept[next(iter(_kept))]
+    _kept[given] = block
+    own = block.copy(order="K")
     own.setflags(write=False)
     return own
-
-
-@lru_cache(maxsize=8)
-def _kept(seed: int, scene: str, repeats: int, samples: int, width: int, design: Design) -> np.ndarray:
-    """Return the noise that cells get copies of."""
-    return draw(seed, scene, repeats, samples, width, "cells", design)
 
 
 def draw(

@@ -535,7 +535,7 @@ def doubling_batches(
 def draw_columns(problem: Problem, stream: str, count: int, block: int) -> np.ndarray:
     """Return noise ``(n_w, count)`` from the named stream of a reference, which is independent of the noise of cells."""
     program = problem.program
-    drawn = noise.draw(block, program.scene.name, 1, count, program.n_noise, stream)
+    drawn = noise.shared(block, program.scene.name, 1, count, program.n_noise, stream=stream)
     return np.moveaxis(drawn, -1, 0).reshape(program.n_noise, count)
 
 

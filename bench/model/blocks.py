@@ -44,10 +44,10 @@ def _n_listed(ranges: str) -> int:
     return sum(int(end[-1]) - int(end[0]) + 1 for end in ends)
 
 
-def columns_in_cache(column_bytes: int, grain: int) -> int:
-    """Return the number of columns that fill half of a core's cache, as a multiple of ``grain``."""
+def columns_in_cache(column_bytes: int) -> int:
+    """Return the number of columns that fill half of a core's cache, within limits."""
     columns = cache_bytes() // 2 // max(column_bytes, 1)
-    return max(1, min(max(columns, MIN_COLUMNS), MAX_COLUMNS) // grain) * grain
+    return min(max(columns, MIN_COLUMNS), MAX_COLUMNS)
 
 
 def n_threads(count: int, threads: int, least: int) -> int:

@@ -118,13 +118,12 @@ class Problem(ABC):
     """A compiled program: costs, gradients and scores of batches of rollouts, in NumPy float64 arrays.
 
     ``theta`` is ``(d,)``, shared by all samples, or ``(d, B)``; ``w`` is ``(n_w, B)``. To limit memory, batches larger
-    than ``block`` columns are split into blocks, padded to a multiple of ``grain`` columns; a single block only to a multiple
-    of ``fine``. Up to ``threads`` blocks run in parallel, each with about ``least`` columns or more.
+    than ``block`` columns are split into blocks. Blocks are padded to a multiple of ``grain`` columns. Up to ``threads`` blocks run
+    in parallel, each with about ``least`` columns or more.
     """
 
     block: int = 1 << 16
     grain: int = 1
-    fine: int = 1
     threads: int = 1
     least: int = blocks.MIN_COLUMNS
     device: str = "cpu"
@@ -158,7 +157,7 @@ class Problem(ABC):
 
     def fit_blocks(self, column_bytes: int) -> None:
         """Set the block size so that a block fills half of a core's cache, at ``column_bytes`` per rollout."""
-        self.block, self.threads = blocks.columns_in_cache(column_bytes, self.grain), blocks.cores()
+        self.block, self.threads = blocks.columns_in_cache(column_bytes), blocks.cores()
 
     @property
     def sigma(self) -> float:
@@ -268,9 +267,7 @@ class Problem(ABC):
     ) -> np.ndarray:
         theta = theta.reshape(self.dim, -1)
         threads = blocks.n_threads(w.shape[1], self.threads, self.least)
-        is_one = threads == 1 and w.shape[1] <= self.block
-        grain = min(self.fine, self.grain) if is_one else self.grain
-        columns = blocks.block_size(w.shape[1], self.block, grain, threads)
+        columns = blocks.block_size(w.shape[1], self.block, self.grain, threads)
 
         def real(theta: np.ndarray, w: np.ndarray) -> np.ndarray:
             values = function(theta, w)

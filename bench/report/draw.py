@@ -97,10 +97,8 @@ def draw(chart: Chart, is_narrow: bool = False) -> Figure:
     # quantities of the same runs above each other have one scale of x, so that their features can be compared
     stacked = chart.own_scales and is_plot
     ratios = [max(heights[i * across : (i + 1) * across]) for i in range(down)]
-    figure = Figure(
-        figsize=(width, 4 + 2 * sum(ratios)),
-        layout=ConstrainedLayoutEngine(w_pad=0.04, h_pad=PAD, rect=(0.006, 0, 0.988, 1)),
-    )
+    engine = ConstrainedLayoutEngine(w_pad=0.04, h_pad=PAD, rect=(0.006, 0, 0.988, 1))
+    figure = Figure(figsize=(width, 4 + 2 * sum(ratios)), layout=engine)
     FigureCanvasAgg(figure)
     grid = figure.subplots(
         down, across, squeeze=False, sharey=is_plot and shared, height_ratios=ratios,
@@ -143,7 +141,7 @@ def draw(chart: Chart, is_narrow: bool = False) -> Figure:
                 panel.set_xlabel("")
         _draw_marks(chart, panel, name)
     _frame(figure, chart, _legend(chart, styles, width))
-    figure.draw_without_rendering()
+    engine.execute(figure)
     drawn = figure.get_figheight() * sum(panel.get_position().height for panel in grid[::across])
     figure.set_figheight(figure.get_figheight() + sum(ratios) - drawn)
     figure.texts[0].set_y(1 - PAD / figure.get_figheight())

@@ -81,9 +81,9 @@ def _settle(figure: Figure) -> None:
     The solver of constrained layouts orders its variables by their addresses in memory, so its results differ between runs
     in the last bits. Where a text is half a pixel from its neighbours, that would move it by a pixel.
     """
-    if figure.get_layout_engine() is not None:
+    if (engine := figure.get_layout_engine()) is not None:
         figure.set_dpi(DPI)
-        figure.draw_without_rendering()
+        engine.execute(figure)
         figure.set_layout_engine("none")
     for axes in figure.axes:
         axes.set_position(Bbox(axes.get_position(original=True).get_points().round(PLACES)))

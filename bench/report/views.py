@@ -127,34 +127,35 @@ def estimator_curves(rows: pd.DataFrame, close: float | None = CLOSE) -> pd.Data
     ``backends``, the median time [s] of one estimate on the fastest of them (NaN if none is timed), and its name ``method``:
     the label, with the backends where an estimator has several curves.
     """
-    rows = attempted(rows)
+    rows = attempted(rows).reset_index(drop=True)
     several = rows["dtype"].nunique() > 1
     rows = rows.assign(label=estimator_labels(rows), run=rows["backend"] + (" " + rows["dtype"] if several else ""))
-    curves = [rows.assign(curve=0, backends="", seconds=math.nan)[:0]]
-    for _, part in rows.groupby("label", sort=False):
-        runs = {
-            name: run.drop_duplicates("x", keep="last").sort_values("x", kind="stable").set_index("x", drop=False)
-            for name, run in part.groupby("run", sort=False)
-        }
+    last = rows[["label", "run", "x"]].drop_duplicates(keep="last").sort_values("x", kind="stable")
+    places = last.groupby(["label", "run"]).groups
+    met, seconds = rows[["x", "status"]].to_numpy(object), rows["time_s"]
+    numbers = rows[["rmse", "variance", "bias_high", "bias"]].to_numpy(float)
+
+    def agree(a: Any, b: Any) -> bool:
+        """Return whether two runs have the same status at every ``x``, and numbers within the relative difference."""
+        if close is None or not np.array_equal(met[a], met[b]):
+            return a is b
+        x, y = numbers[a], numbers[b]
+        with np.errstate(invalid="ignore"):
+            margin = close * np.fmax(*np.abs([x, y]))[:, [0, 1, 2, 2]]
+            return bool(((x == y) | (np.isnan(x) & np.isnan(y)) | (np.abs(x - y) <= margin)).all())
+
+    curves: list[tuple[Any, ...]] = []
+    for label, names in rows.groupby("label", sort=False)["run"].unique().items():
+        runs = {name: places[label, name].to_numpy() for name in names}
         while runs:
             first = next(iter(runs.values()))
-            alike = [n for n, run in runs.items() if run is first or (close is not None and _agree(first, run, close))]
-            times = pd.Series([runs.pop(name)["time_s"].median() for name in alike])
-            curves.append(first.assign(curve=len(curves), backends=", ".join(alike), seconds=times[times > 0].min()))
-    frame = pd.concat(curves, ignore_index=True)
+            alike = [name for name, run in runs.items() if agree(first, run)]
+            times = pd.Series([seconds[runs.pop(name)].median() for name in alike])
+            curves += [(place, len(curves), ", ".join(alike), times[times > 0].min()) for place in first]
+    found = pd.DataFrame(curves, columns=["place", "curve", "backends", "seconds"])
+    frame = rows.loc[found.pop("place")].reset_index(drop=True).assign(**found)
     is_only = frame.groupby("label")["curve"].transform("nunique") == 1
     return frame.assign(method=frame["label"].where(is_only, frame["label"] + " (" + frame["backends"] + ")"))
-
-
-def _agree(a: pd.DataFrame, b: pd.DataFrame, tolerance: float) -> bool:
-    """Return whether two backends have the same status at every ``x``, and numbers within a relative tolerance."""
-    if not a["status"].equals(b["status"]):
-        return False
-    x, y = (run[["rmse", "variance", "bias_high", "bias"]].to_numpy(float) for run in (a, b))
-    with np.errstate(invalid="ignore"):
-        margin = tolerance * np.fmax(np.abs(x), np.abs(y))[:, [0, 1, 2, 2]]
-        alike = (x == y) | (np.isnan(x) & np.isnan(y)) | (np.abs(x - y) <= margin)
-    return bool(alike.all())
 
 
 def is_logarithmic(values: Any) -> bool:

@@ -98,7 +98,7 @@ def _traced(program: Program, function: str, dtype: str) -> _Source:
 class FusedProblem(JaxProblem):
     """A program as compiled kernels for any batch and horizon; float parameters are arguments."""
 
-    grain = fine = emit.LANES
+    grain = emit.LANES
     # a thread with fewer columns takes less time than starting it
     least = 4096
 
@@ -116,12 +116,6 @@ class FusedProblem(JaxProblem):
     def _kernel(self, function: str, theta: np.ndarray, w: np.ndarray, rows: int) -> tuple[np.ndarray, bool]:
         """Return a kernel's result ``(rows, B)``, and whether all derivatives are so small that all costs are finite."""
         batch = w.shape[1]
-        if batch % self.grain:
-            # a batch that is smaller than a block is not padded yet
-            missing = -batch % self.grain
-            padded = [np.pad(x, ((0, 0), (0, missing)), mode="edge") if x.shape[1] == batch else x for x in (theta, w)]
-            result, is_bounded = self._kernel(function, padded[0], padded[1], rows)
-            return result[:, :batch], is_bounded
         if not batch:
             return np.empty((rows, 0)), True
         source = _source(self.program, function, self._dtype.name)

@@ -123,7 +123,7 @@ class JaxProblem(Problem):
     """
 
     # a single column is compiled to other operations, whose last digit differs
-    grain, fine = 128, 2
+    grain = 2
     variant: Any = None
     """What else distinguishes the executables of a subclass."""
 

@@ -134,8 +134,6 @@ class Mjx(Jax):
 class MjxProblem(JaxProblem):
     """A program stepped by MJX. A processor has two compiled shapes: one column, for small batches, and 16."""
 
-    fine = 16
-
     def _blocks(
         self, function: Callable[..., np.ndarray], theta: np.ndarray, w: np.ndarray, lead: tuple[int, ...]
     ) -> np.ndarray:

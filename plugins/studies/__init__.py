@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -89,7 +89,7 @@ def against_reference(
     surrogate = SURROGATE if estimator and program.surrogate and "grad" in estimator.needs else ""
     doubt = estimator.remark(json.loads(auxiliaries)) if estimator and auxiliaries else ""
     remarks = (surrogate, summary.note, doubt, truth.note)
-    values = {name: value for name, value in asdict(summary).items() if name != "note"}
+    values = {name: value for name, value in vars(summary).items() if name != "note"}
     return result | values | finite_status("", estimates) | {"reason": "; ".join(filter(None, remarks))}
 
 

@@ -171,11 +171,12 @@ def drawn(monkeypatch):
     seen = []
     plain = noise.draw
 
-    def draw(seed, scene, repeats, samples, width, stream):
-        seen.append((stream, seed, samples))
-        return plain(seed, scene, repeats, samples, width, stream)
+    def draw(*given):
+        seen.append((given[5], given[0], given[3]))
+        return plain(*given)
 
     monkeypatch.setattr(noise, "draw", draw)
+    monkeypatch.setattr(noise, "_kept", {})
     return seen
 
 

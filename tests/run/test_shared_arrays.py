@@ -104,8 +104,9 @@ def test_every_caller_has_arrays_of_its_own(tmp_path):
     assert drawn[0].strides == noise.draw(0, "quadratic", 2, 3, 4, "cells").strides
 
 
-def test_noise_above_the_limit_is_drawn_afresh(monkeypatch):
-    monkeypatch.setattr(noise, "HELD", 10)
-    before = noise._kept.cache_info().currsize
-    assert np.array_equal(noise.shared(0, "own", 2, 3, 4), noise.draw(0, "own", 2, 3, 4, "cells"))
-    assert noise._kept.cache_info().currsize == before
+def test_noise_is_kept_within_limits(monkeypatch):
+    for limit, value in (("HELD", 10), ("KEPT", 16), ("_kept", {})):
+        monkeypatch.setattr(noise, limit, value)
+    for name, samples in (("a", 2), ("b", 6), ("c", 2), ("a", 2), ("d", 2)):
+        noise.shared(0, name, 1, samples, 4)
+    assert [name for _, name, *_ in noise._kept] == ["a", "d"]

@@ -140,22 +140,17 @@ def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:
         of = methods[(methods["axis"] == along) & (methods["problem"] == problem)] if is_swept else level
         spent = of["rollouts"].where(of["rollouts"] > 0)
         least = level.loc[~level["has_fixed_work"], "rollouts"].min()
+        names, law, each = pd.factorize(of["method"])[0], of["has_law"].to_numpy(bool), spent.to_numpy()
         apart = {
-            cost: np.abs(np.log(spent / cost))
-            .where(of["has_law"] | (spent <= SAME_COST * cost), math.inf)
-            .fillna(math.inf)
+            cost: np.where(law | (each <= SAME_COST * cost), np.abs(np.log(each / cost)), math.inf)
             for cost in sorted(level["rollouts"].unique())
             if cost > 0 and not cost < least
         }
-        same = {
-            cost: (distance <= math.log(SAME_COST)) | (~of["has_law"] & (spent <= cost))
-            for cost, distance in apart.items()
-        }
+        same = {cost: (distance <= math.log(SAME_COST)) | (~law & (each <= cost)) for cost, distance in apart.items()}
         order = 1 if is_swept else -1
-        cost = max(
-            same, key=lambda c: (of.loc[same[c] | of["has_law"], "method"].nunique(), order * c), default=math.nan
-        )
-        nearest = of.loc[apart[cost].groupby(of["method"], sort=False).idxmin()] if apart else level
+        cost = max(same, key=lambda c: (np.unique(names[same[c] | law]).size, order * c), default=math.nan)
+        distances = pd.Series(apart.get(cost), of.index, float).fillna(math.inf)
+        nearest = of.loc[distances.groupby(of["method"], sort=False).idxmin()] if apart else level
         scale = (spent / cost).where(of["has_law"]).mask(same[cost], 1.0) if apart else spent
         found = _scaled(nearest, scale.loc[nearest.index]).assign(rollouts=cost)
         share = (spent.loc[nearest.index] / cost).where(~found["has_law"] & ~found["has_fixed_work"]).clip(upper=1.0)
@@ -225,7 +220,8 @@ def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
     first and those tied with it whose error is near.
     """
     names = [*SETTING, "not_comparable", "first", *VALUE, "second", *FACTOR, "tied", "leaders"]
-    lines = [_compared(level) for _, level in methods.groupby("setting", sort=False)]
+    used = methods[[*SETTING, "method", "estimator", *ERROR, "error_is_limit", "not_comparable"]]
+    lines = [_compared(level) for _, level in used.groupby("setting", sort=False)]
     return pd.DataFrame(lines, columns=names)
 
 
