@@ -264,7 +264,8 @@ def test_a_star_import_replaces_no_builtin():
 
 
 @pytest.mark.parametrize(
-    "name", ["host.parameters", "host.identity", "report.text", "experiment.grid", "errors", "claims.claim"]
+    "name",
+    ["host.parameters", "host.identity", "report.text", "report.names", "experiment.grid", "errors", "claims.claim"],
 )
 def test_examples_in_docstrings(name):
     done = doctest.testmod(importlib.import_module(f"bench.{name}"))

@@ -67,7 +67,9 @@ class Column:
     """Significant digits in tables for readers."""
     low: str = field(default="", kw_only=True)
     high: str = field(default="", kw_only=True)
-    """The columns with the ends of the 95% interval, empty if there is none."""
+    """The columns with the ends of the interval, empty if there is none."""
+    ends: str = field(default="95% interval", kw_only=True)
+    """What the interval contains, in the legends of charts."""
     boundary: float | None = field(default=None, kw_only=True)
     """The value that intervals are compared with: an end that differs from it never prints as it."""
     limit: str = field(default="", kw_only=True)
@@ -112,6 +114,7 @@ def bounded(
     """Return a column and those of the ends of its intervals ``of`` some kind, ``<stem>_low`` and ``<stem>_high``."""
     names = [f"{stem or name}_{end}" for end in ("low", "high")]
     plain = {"measured": more.get("measured", False), "table": has_csv}
+    more = {"ends": of.partition(" ")[2]} | more
     ends = zip(names, ("lower", "upper"), strict=True)
     return [
         kind(name, doc, unit, low=names[0], high=names[1], **more),

@@ -267,8 +267,9 @@ def _refuse_unread(experiment: Experiment, overrides: Sequence[Override]) -> Non
         marked = {part for axis in axes for part in (axis, parameter_name(axis))}
         if head == "marks" and (unread := experiment.marks.keys() - marked):
             raise unknown("mark", min(unread), marked)
-        if head == "compares" and (unread := experiment.compares.keys() - {"backends", "estimators", *marked}):
-            raise unknown("part of compares", min(unread), {"backends", "estimators", *marked})
+        marked |= {"backends", "contacts", "estimators"}
+        if head == "compares" and (unread := experiment.compares.keys() - marked):
+            raise unknown("part of compares", min(unread), marked)
 
 
 def _in_use(plugins: Sequence[type[Plugin]]) -> list[type[Plugin]]:

@@ -62,7 +62,7 @@ class Chart:
     y: Sequence[Column]
     kind: ChartKind = "lines"
     title: str = ""
-    """By default the experiment's question, and on the page the name."""
+    """What the chart answers; in the file of an experiment's main chart that is the experiment's question."""
     series: str = ""
     """The column whose values have a colour and a marker each."""
     line: str = ""
@@ -85,20 +85,22 @@ class Chart:
     marks: Sequence[Mark] = ()
     join: bool = False
     arrow: str = ""
-    """The column whose values are one or two points each: ``points`` joins two by an arrow, and names their series there.
-    Markers are those of ``line``."""
+    """The column whose values are one or two points each: ``points`` joins two by an arrow, named ``arrow_name``."""
+    arrow_name: str = ""
     failed: str = ""
-    """The column that is true where a point has no value: a cross at the upper edge."""
+    """The column that is true where a point has no value: a cross at the upper edge, named ``failed_name`` like a blank cell."""
+    failed_name: str = "no result"
     across: int = 4
     """Most panels side by side."""
     height: float = 2.3
     """Height of a panel in inches; of a row of dots or cells, in ``dots`` and ``grid``, if below 1."""
+    steps: bool = False
+    """Whether lines are steps: each value holds up to the next one."""
     band: bool = False
     """Whether intervals are drawn as bands and not as bars."""
     own_scales: bool = False
-    """Whether each panel has its own scale of y (of x, for dots); plots are then above each other and share that of x.
-
-    Without ``panel``, each quantity of ``y`` has a panel."""
+    """Whether each panel has its own scale of x, for dots. Plots then share that of x, and each quantity of ``y`` has a row of
+    panels with one scale, or with ``across=1`` each panel its own."""
 
     def __post_init__(self) -> None:
         if missing := sorted(set(self._names()) - set(self.frame)):

@@ -35,17 +35,17 @@ def looks_by_name(charts: Sequence[Chart]) -> dict[str, Style]:
 
 
 def graded(
-    errors: pd.Series, grades: Mapping[float, str], unit: Callable[[float], str]
+    values: pd.Series, grades: Mapping[float, str], words: Callable[[str], str], unit: Callable[[float], str]
 ) -> tuple[pd.Series, dict[str, Style]]:
-    """Return the grade of each error, and the look of each grade. ``grades`` are colours by upper end, the last of them infinite.
+    """Return the grade of each value, and the look of each grade. ``grades`` are colours by upper end, the last of them infinite.
 
-    ``unit`` formats the ends: ``error below 10%``, ``error 100% or more``.
+    ``words`` and ``unit`` format the ends: ``error below 10%``, ``error 100% or more``.
     """
     *ends, most = grades
-    names = [*(f"error below {unit(end)}" for end in ends), f"error {unit(ends[-1])} or more"]
-    place = np.searchsorted(ends, errors.fillna(most), side="right")
+    names = [*(words(f"below {unit(end)}") for end in ends), words(f"{unit(ends[-1])} or more")]
+    place = np.searchsorted(ends, values.fillna(most), side="right")
     looks = {name: Style(colour) for name, colour in zip(names, grades.values(), strict=True)}
-    return pd.Series(np.array(names, dtype=object)[place], errors.index), looks
+    return pd.Series(np.array(names, dtype=object)[place], values.index), looks
 
 
 def estimator_style(estimator: str, variant: int = 0) -> Style:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
 from typing import Any, Literal
 
 import numpy as np
@@ -18,15 +17,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Rectangle
+from matplotlib.patches import Rectangle
 from matplotlib.ticker import FixedLocator
 
 from bench.experiment.columns import Column
 from bench.experiment.views import Chart, Mark, Style
 from bench.report.colours import looks_by_name
-from bench.report.scales import log_axis
-from bench.report.style import GREY, MARKERS, MARKS, SHADE, SIZE, filled, plain, width_in_inches
+from bench.report.names import in_words
+from bench.report.scales import LARGEST, SMALLEST, log_axis
+from bench.report.style import GREY, MARKS, SHADE, SIZE, filled, plain, width_in_inches
 from bench.report.text import axis_value, number, short_duration
 from bench.report.views import is_logarithmic
 
@@ -44,16 +43,13 @@ DOT = 0.075
 """Height in inches of a series in a row of dots."""
 BELOW = 0.35
 """Height of further quantities below the first, relative to its height."""
-UNLIMITED = 1e9
-"""Factor on a value at which the bar of an interval without an upper end stops, beyond every logarithmic axis."""
 BAND: dict[str, Any] = {"color": "#D55E00", "alpha": 0.12, "linewidth": 0}
 """Look of a named range of an axis."""
 USELESS = 1e2
 """Where a value above 1 means a failure, larger values are drawn here with their number."""
-NAME = 0.8
-"""Longest line of a name at a point, in inches."""
-BEHIND: dict[str, Any] = {"facecolor": "#ffffff", "alpha": 0.7, "linewidth": 0, "pad": 0.5}
-"""Look of the ground of a name at a point, which may cross an arrow."""
+CUT = SIZE + 1
+"""Height of the line of such a number, in points."""
+HOLLOW: dict[str, Any] = {"markerfacecolor": "white"}
 NEAR = 0.2
 """Distance in inches from which an arrow joins two points."""
 LIMIT: dict[str, Any] = {"color": "#000000", "linewidth": 1.4}
@@ -65,72 +61,71 @@ MANY = 12
 def draw(chart: Chart, is_narrow: bool = False) -> Figure:
     """Return the chart as a figure, two columns of a paper wide, or one for plots without panels side by side.
 
-    If ``is_narrow`` it is one column wide, with one panel across.
+    If ``is_narrow`` it is one column wide, with one panel across. Names are shortened: see :mod:`bench.report.names`.
     """
-    panels = [(str(name), part) for name, part in chart.frame.groupby(chart.panel, sort=False)] if chart.panel else []
-    panels = panels or [("", chart.frame)]
+    chart = in_words(chart)
+    parts = [(str(name), part) for name, part in chart.frame.groupby(chart.panel, sort=False)] if chart.panel else []
+    parts = parts or [("", chart.frame)]
     is_plot = chart.kind in ("lines", "points")
-    quantities = [chart.y[0]] * len(panels)
-    if chart.own_scales and not chart.panel:
-        panels, quantities = panels * len(chart.y), list(chart.y)
+    # quantities of the same runs above each other have one scale of x, so that their features can be compared
+    stacked = chart.own_scales and is_plot
+    panels = [(name, part, y) for y in chart.y[: len(chart.y) if stacked else 1] for name, part in parts]
     most = 1 if is_narrow or not chart.panel else chart.across
-    width = NARROW if is_narrow or (is_plot and (len(panels) == 1 or not chart.panel)) else WIDTH
-    down = math.ceil(len(panels) / max(1, min(most, len(panels))))
+    width = NARROW if is_narrow or (is_plot and (len(parts) == 1 or not chart.panel)) else WIDTH
+    down = math.ceil(len(panels) / max(1, min(most, len(parts))))
     across = math.ceil(len(panels) / down)
-    styles = looks_by_name([chart])
+    is_keyed = chart.kind != "dots" or chart.series != chart.y[0].name  # else each row has its name
+    styles = {
+        name: replace(style, meaning=(style.meaning or name) * is_keyed)
+        for name, style in looks_by_name([chart]).items()
+    }
 
-    rows = [[] if is_plot else _categories(chart.y[0], part, downwards=True) for _, part in panels]
+    rows = [[] if is_plot else _categories(y, part, downwards=True) for _, part, y in panels]
     # panels with the same rows have labels once, at the left
     shared = not chart.own_scales if is_plot else all(names == rows[0] for names in rows)
     beside = 1 if shared else across
     room = (0.46 if shared else 0.42 / across) * width
     labels = [[_wrapped(name, room) for name in names] for names in rows]
     written = [text for names in labels for text in names]
-    inner = (width - beside * (0.7 if is_plot else max(map(_text_width, written), default=0.0))) / across - 0.12
+    inner = (width - beside * (0.85 if is_plot else max(map(_text_width, written), default=0.0))) / across - 0.12
     is_spread = chart.kind == "dots" and not chart.join and chart.series not in ("", chart.y[0].name)
     row = max(
         [chart.height, DOT * len(styles) * is_spread, *(LINE * (1 + text.count("\n")) + 0.015 for text in written)]
     )
-    heights = [chart.height if is_plot else row * len(names) + 0.1 for names in rows]
-    heights = [height if y is chart.y[0] else BELOW * height for height, y in zip(heights, quantities, strict=True)]
-
-    # quantities of the same runs above each other have one scale of x, so that their features can be compared
-    stacked = chart.own_scales and is_plot
+    heights = [
+        (chart.height if is_plot else row * len(names) + 0.1) * (1.0 if y is chart.y[0] else BELOW)
+        for names, (*_, y) in zip(rows, panels, strict=True)
+    ]
     ratios = [max(heights[i * across : (i + 1) * across]) for i in range(down)]
     engine = ConstrainedLayoutEngine(w_pad=0.04, h_pad=PAD, rect=(0.006, 0, 0.988, 1))
     figure = Figure(figsize=(width, 4 + 2 * sum(ratios)), layout=engine)
     FigureCanvasAgg(figure)
     grid = figure.subplots(
-        down, across, squeeze=False, sharey=is_plot and shared, height_ratios=ratios,
+        down, across, squeeze=False, sharey=is_plot and (shared or (chart.across > 1 and "row")), height_ratios=ratios,
         sharex=stacked or (not chart.own_scales and chart.kind == "dots"),
     ).ravel()  # fmt: skip
     for spare in grid[len(panels) :]:
         spare.remove()
-    for place, (panel, (name, part), names, y) in enumerate(zip(grid, panels, rows, quantities, strict=False)):
+    for place, (panel, (name, part, y), names) in enumerate(zip(grid, panels, rows, strict=False)):
         is_left, is_last = place % across == 0 or not shared, place + across >= len(panels)
-        title = "\n".join(
-            _wrapped(text, inner)
-            for text in (name, chart.panel_notes.get(name, ""))
-            if text and (len(panels) > 1 or not chart.subtitle.startswith(text))
-        )
-        panel.set_title(title, loc="left", fontsize=SIZE)
         if is_plot:
-            _draw_lines(chart, panel, part, styles, y)
-            few = all(p[chart.x[0].name].nunique() <= 6 for _, p in panels)
-            _scale_x(panel, chart.x[0], part[chart.x[0].name], few, bool(chart.arrow))
-            _scale_values(chart, panel, "y", y, part if chart.own_scales else chart.frame)
+            scaled = part if stacked and chart.across == 1 else chart.frame
+            _draw_lines(chart, panel, part, styles, y, _is_log(y, scaled[y.name]))
+            few = all(p[chart.x[0].name].nunique() <= 6 for _, p in parts)
+            _scale_x(panel, chart.x[0], chart.frame if stacked else part, few)
+            _scale_values(chart, panel, "y", y, scaled)
             if y is not chart.y[0]:
                 panel.margins(y=0.4)
             elif chart.arrow:
-                _draw_arrows(chart, panel, part, styles, np.array([inner, heights[place]]))
+                _draw_arrows(chart, panel, part, styles)
             panel.set_xlabel("" if stacked and not is_last else _wrapped(chart.x[0].heading, inner))
-            panel.set_ylabel(_wrapped(y.heading, heights[place]) if is_left else "")
+            panel.set_ylabel(_wrapped(y.heading, heights[place]) if place % across == 0 else "")
         else:
             panel.set_yticks(range(len(names)), labels[place][::-1])
             panel.set_ylim(-0.5, len(names) - 0.5)
             panel.tick_params(axis="y", length=0, labelleft=is_left)
-            is_named = is_left and (chart.y[0].label or chart.y[0].kind == "number")
-            panel.set_ylabel(_wrapped(chart.y[0].heading, heights[place]) if is_named else "")
+            is_named = is_left and (y.label or y.kind == "number")
+            panel.set_ylabel(_wrapped(y.heading, heights[place]) if is_named else "")
             cells = {label: len(names) - 1 - i for i, label in enumerate(names)}
             if chart.kind == "dots":
                 _draw_dots(chart, panel, part, styles, cells)
@@ -140,7 +135,14 @@ def draw(chart: Chart, is_narrow: bool = False) -> Figure:
             if not is_last and not chart.own_scales:
                 panel.set_xlabel("")
         _draw_marks(chart, panel, name)
-    _frame(figure, chart, _legend(chart, styles, width))
+        is_first = y is chart.y[0]
+        is_named = (len(parts) > 1 or not chart.subtitle.startswith(name)) and (is_first or across == 1)
+        texts = name * is_named, chart.panel_notes.get(name, "") if is_first else y.doc
+        title = [_wrapped(text, inner) for text in texts if text]
+        # values beyond the panel are written between it and its title
+        cuts = sum(text.get_gid() == "cut" for text in panel.texts)
+        panel.set_title("\n".join(title), loc="left", fontsize=SIZE, pad=4 + CUT * cuts)
+    _frame(figure, chart, [style.meaning for style in styles.values()])
     engine.execute(figure)
     drawn = figure.get_figheight() * sum(panel.get_position().height for panel in grid[::across])
     figure.set_figheight(figure.get_figheight() + sum(ratios) - drawn)
@@ -151,19 +153,25 @@ def draw(chart: Chart, is_narrow: bool = False) -> Figure:
 # ------------------------------------------------------------------------------------- title, legend and texts
 
 
-def _frame(figure: Figure, chart: Chart, legend: Sequence[Any]) -> None:
-    """Write title and subtitle above the panels, and the legend below them."""
+def _frame(figure: Figure, chart: Chart, first: Sequence[str]) -> None:
+    """Write title and subtitle above the panels, and below them the legend: what they have drawn under a name, ``first`` series."""
     width = figure.get_figwidth()
     title = _wrapped(chart.title.rstrip("."), 0.97 * width / BOLD)
-    subtitle = _wrapped(", ".join(filter(None, [chart.subtitle.rstrip("."), *_signs(chart)])), 0.97 * width)
+    subtitle = _wrapped(chart.subtitle.rstrip("."), 0.97 * width)
     look: dict[str, Any] = {"x": 0.06 / width, "ha": "left", "va": "top"}
     figure.text(y=1, s=title, fontsize=SIZE + 1, fontweight="bold", **look)
     # blank lines leave the place of the title
     below = "\n".join([" "] * (title.count("\n") + 1) + [subtitle] * bool(subtitle))
     figure.suptitle(below, fontsize=SIZE, color=GREY, linespacing=1.35, **look)
-    if legend:
+    drawn = {
+        name: handle for panel in figure.axes for handle, name in zip(*panel.get_legend_handles_labels(), strict=True)
+    }
+    places = {plain(name): place for place, name in enumerate(first)}
+    names = sorted(drawn, key=lambda name: places.get(name, len(places)))
+    if drawn:
+        labels = [_wrapped(name, width - 0.6) for name in names]
         figure.legend(
-            handles=legend, loc="outside lower center", ncols=_legend_columns([str(handle.get_label()) for handle in legend], width),
+            [drawn[name] for name in names], labels, loc="outside lower center", ncols=_legend_columns(labels, width),
             frameon=False, fontsize=SIZE, columnspacing=1.2, handletextpad=0.5, labelspacing=0.25, borderaxespad=0.1,
         )  # fmt: skip
 
@@ -177,57 +185,15 @@ def _text_width(text: str) -> float:
     return max(map(width_in_inches, text.split("\n")))
 
 
-def _signs(chart: Chart) -> list[str]:
-    """Return what a grey area and hollow markers mean, where the chart has them."""
-    column = {"lines": chart.y[0], "points": chart.y[0], "dots": chart.x[0]}.get(chart.kind)
-    if not column:
-        return []
-    is_grey = column.above_one and _is_log(column, chart.frame[column.name]) and _log_range(column, chart.frame)[1] > 1
-    values = chart.frame[column.name]
-    is_hollow = (column.limit and chart.frame[column.limit].eq(True).any()) or (
-        column.least and (values < column.least).any()
-    )
-    return [f"grey: {column.above_one}"] * bool(is_grey) + ["hollow: an upper limit"] * bool(is_hollow)
-
-
-def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
-    """Return the handles of the legend: series or levels, the front, and named values and ranges of the axes."""
-    named = {name: style for name, style in styles.items() if name and not chart.arrow}
-    labels = {name: _wrapped(style.meaning or name, width - 0.6) for name, style in named.items()}
-    handles: list[Any] = []
-    if chart.kind == "grid":
-        looks: dict[str, Any] = {"edgecolor": "#808080", "linewidth": 0.4}
-        handles = [Patch(facecolor=styles[name].colour, label=label, **looks) for name, label in labels.items()]
-    elif chart.kind != "dots" or chart.series != chart.y[0].name:
-        keys = [key for key in dict.fromkeys((chart.panel, chart.series, chart.line)) if key]
-        is_line = chart.kind == "lines"
-        bare = is_line and keys and chart.frame.groupby(keys).size().min() > MANY
-        for name, label in labels.items():
-            style = styles[name]
-            mark = "" if bare and style.line != "none" else style.marker
-            line: Any = style.line if is_line else "none"
-            handles.append(
-                Line2D([], [], color=style.colour, marker=mark, linestyle=line, linewidth=style.width, label=label)
-            )
-    if chart.arrow:
-        laws = zip(MARKERS, chart.frame[chart.line].unique(), strict=False)
-        handles += [
-            Line2D([], [], color=GREY, marker=marker, linestyle="none", label=plain(str(law))) for marker, law in laws
-        ]
-    handles += [Line2D([], [], label=chart.limit_name, **LIMIT)] * bool(
-        chart.limit and (chart.frame[chart.limit] > 0).any()
-    )
-    ranges = dict.fromkeys(mark.name for mark in chart.marks if mark.to is not None)
-    handles += [Line2D([], [], label=plain(name), **look) for name, look in _mark_looks(chart).items() if name]
-    return handles + [Patch(label=plain(name), **BAND) for name in ranges]
+def _name(panel: Axes, name: str, **look: Any) -> None:
+    """Name a kind of mark in the legend, beside an example of it."""
+    panel.plot([], [], **{"color": GREY, "linestyle": "none", "label": plain(name)} | look)
 
 
 def _legend_columns(labels: Sequence[str], width: float) -> int:
     lengths = np.array([0.5 + _text_width(label) for label in labels])
-    for count in range(min(len(lengths), 8), 1, -1):
-        if sum(part.max() for part in np.array_split(lengths, count)) <= width:
-            return count
-    return 1
+    counts = range(min(len(lengths), 8), 1, -1)
+    return next((n for n in counts if sum(part.max() for part in np.array_split(lengths, n)) <= width), 1)
 
 
 # ------------------------------------------------------------------------------------------------------ scales
@@ -255,7 +221,7 @@ def _scale_values(chart: Chart, panel: Axes, which: Literal["x", "y"], column: C
         low, high = _log_range(column, rows, [mark for mark in chart.marks if mark.axis == which])
         log_axis(panel, which, low, high, text=_values_text(column, 0.0))
         if column.above_one and high > 1:
-            (panel.axvspan if which == "x" else panel.axhspan)(1.0, high, zorder=0, **SHADE)
+            (panel.axvspan if which == "x" else panel.axhspan)(1.0, high, zorder=0, label=column.above_one, **SHADE)
     elif text := _values_text(column, rows[column.name].abs().max()):
         (panel.xaxis if which == "x" else panel.yaxis).set_major_formatter(lambda value, _: text(value))
 
@@ -274,97 +240,64 @@ def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[Mark] = ()) -
     return min(every) / margin, max(every) * margin
 
 
-def _scale_x(panel: Axes, column: Column, values: pd.Series, few: bool, is_named: bool) -> None:
-    """Set the scale of x, with a label at each of the ``values`` if all panels have ``few``, and room for names at points."""
+def _scale_x(panel: Axes, column: Column, rows: pd.DataFrame, few: bool) -> None:
+    """Set the scale of x, with a label at each of the values if all panels have ``few``."""
+    values = rows[column.name]
     if not pd.api.types.is_numeric_dtype(values):
         panel.tick_params(axis="x", rotation=30)
         return
     places = np.unique(values[np.isfinite(values)])
-    if not places.size:
-        return
-    if _is_log(column, places) and places[0] > 0:
-        margin = max((places[-1] / places[0]) ** 0.05, 1.08)
-        before, after = (margin**2, margin**7) if is_named else (margin, margin)
+    text = _values_text(column, places.max(initial=0.0))
+    if _is_log(column, places) and (places > 0).all():
         wanted = places if few and column.format == "setting" else ()
-        log_axis(panel, "x", places[0] / before, places[-1] * after, wanted, _values_text(column, 0.0))
+        log_axis(panel, "x", *_log_range(column, rows), wanted, _values_text(column, 0.0))
         return
     if few:
         panel.xaxis.set_major_locator(FixedLocator(list(places)))
-    if text := _values_text(column, places[-1]):
+    if text:
         panel.xaxis.set_major_formatter(lambda value, _: text(value))
 
 
-def _mark_looks(chart: Chart) -> dict[str, dict[str, Any]]:
-    """Return the look of each name of marked values; those without a name are quiet lines, not to be taken for a series."""
-    names = list(dict.fromkeys(mark.name for mark in chart.marks if mark.name and mark.to is None))
-    looks = {name: {"color": "#595959", "linestyle": MARKS[i % len(MARKS)]} for i, name in enumerate(names)}
-    return {name: look | {"linewidth": 0.9} for name, look in looks.items()} | {
-        "": {"color": "#c0c0c0", "linewidth": 0.9}
-    }
-
-
 def _draw_marks(chart: Chart, panel: Axes, name: str) -> None:
-    """Draw the named values and ranges of the axes."""
-    looks = _mark_looks(chart)
+    """Draw the named values and ranges of the axes; values without a name are quiet lines, not to be taken for a series."""
+    names = list(dict.fromkeys(mark.name for mark in chart.marks if mark.name and mark.to is None))
     for mark in chart.marks:
         low, high = panel.get_xlim() if mark.axis == "x" else panel.get_ylim()
+        look: dict[str, Any] = {"label": plain(mark.name), "linewidth": 0.9, "color": "#c0c0c0"}
+        if mark.name in names:
+            look |= {"color": "#595959", "linestyle": MARKS[names.index(mark.name) % len(MARKS)]}
         if mark.panel not in (None, name):
             continue
         if mark.to is None and low < mark.at < high:
-            (panel.axvline if mark.axis == "x" else panel.axhline)(mark.at, zorder=1, **looks[mark.name])
+            (panel.axvline if mark.axis == "x" else panel.axhline)(mark.at, zorder=1, **look)
         elif mark.to is not None and max(mark.at, low) < min(mark.to, high):
             span = panel.axvspan if mark.axis == "x" else panel.axhspan
-            span(max(mark.at, low), min(mark.to, high), zorder=0, **BAND)
+            span(max(mark.at, low), min(mark.to, high), zorder=0, label=plain(mark.name), **BAND)
 
 
 # -------------------------------------------------------------------------------------------- lines and points
 
 
-def _draw_lines(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], y: Column) -> None:
+def _draw_lines(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], y: Column, log: bool) -> None:
     x = chart.x[0]
-    log = _is_log(y, (part if chart.own_scales else chart.frame)[y.name])
     keys = [key for key in dict.fromkeys((chart.series, chart.line)) if key]
-    laws = list(chart.frame[chart.line].unique()) if chart.arrow else []
     for order, (key, points) in enumerate(part.groupby(keys, sort=False) if keys else [(("",), part)]):
         style = styles[str(key[0]) if chart.series else ""]
-        if chart.arrow:
-            style = replace(style, marker=MARKERS[laws.index(key[1])])
         is_line, is_number = chart.kind == "lines", pd.api.types.is_numeric_dtype(points[x.name])
         points = points.sort_values(x.name, kind="stable") if is_line and is_number else points
         mark = style.marker if not is_line or len(points) <= MANY or style.line == "none" else ""
         _draw_values(chart, panel, points, y, log, points[x.name].to_numpy(), style, mark, 3 + 0.01 * order)
 
 
-def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], size: np.ndarray) -> None:
-    """Join the two points of each arrow of a panel of ``size`` (2,) inches, and name the series beside the first of them.
-
-    Of the places at a point the name is where fewest points, arrows and other names are.
-    """
-    low, high = (np.log(ends) for ends in zip(panel.get_xlim(), panel.get_ylim(), strict=True))
-    taken: list[tuple[np.ndarray, np.ndarray]] = []
-    named: list[tuple[str, np.ndarray]] = []
+def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style]) -> None:
+    """Join the points of each arrow that has two, where they are apart."""
+    x, y = chart.x[0], chart.y[0]
     for _, points in part.groupby(chart.arrow, sort=False):
-        ends = points[[chart.x[0].name, chart.y[0].name]].to_numpy(float, copy=True)
-        if chart.y[0].above_one:
-            ends[:, 1] = ends[:, 1].clip(chart.y[0].least, USELESS)
-        series, places = str(points[chart.series].iloc[0]), (np.log(ends) - low) / (high - low) * size
-        if np.ptp(places, axis=0).max() > NEAR:
-            look = {"arrowstyle": "-|>", "color": styles[series].colour, "linewidth": 1.6, "shrinkA": 3, "shrinkB": 3}
+        ends = np.array([points[x.name], points[y.name].clip(y.least, USELESS)], dtype=float).T
+        if np.ptp(panel.transData.transform(ends), axis=0).max() > NEAR * panel.get_figure().dpi:
+            look = {"arrowstyle": "-|>", "color": styles[str(points[chart.series].iloc[0])].colour, "linewidth": 1.6}
             panel.annotate("", ends[-1], ends[0], arrowprops=look, zorder=2)
-        taken.append((places.min(axis=0) - 0.05, places.max(axis=0) + 0.05))
-        named.append((series, places[0]))
-    for series, place in named:
-        text = _wrapped(series, NAME, r"_ ,/\[")
-        width, height = extent = np.array([_text_width(text), 0.14 * (text.count("\n") + 1)])
-        across, along = (0.08, -width / 2, -width - 0.08), (-height / 2, 0.08, -height - 0.08)
-        starts = [place + side for side in product(across, along) if side != (across[1], along[0])]
-        outside = [((start < 0) | (start + extent > size)).any() for start in starts]
-        crossed = [sum((start < b).all() and (start + extent > a).all() for a, b in taken) for start in starts]
-        _, _, best = min(zip(outside, crossed, range(8), strict=True))
-        taken.append((starts[best], starts[best] + extent))
-        x, y = starts[best] / size
-        written = panel.text(x, y, text, transform=panel.transAxes, color=styles[series].colour, bbox=BEHIND)
-        written.set_in_layout(False)
+            _name(panel, chart.arrow_name, marker="$\u2192$", markersize=10)
 
 
 def _draw_values(
@@ -383,10 +316,11 @@ def _draw_values(
     limit, lost = (
         points[name].to_numpy(bool) if name else np.zeros(len(points), bool) for name in (column.limit, chart.failed)
     )
-    least, most = (column.least, USELESS if column.above_one else math.inf) if log else (0.0, math.inf)
-    is_zero, is_cut = log & (values <= least), values > most
-    given, values = values, np.where(is_zero & (least == 0), np.nan, values.clip(least, most) if log else values)
-    limit, is_zero = limit | is_zero, is_zero & (least == 0)
+    most = USELESS if log and column.above_one else math.inf
+    given, is_cut = values, values > most
+    if log:  # what has no logarithm is an upper limit too, at the least value that has one
+        every = chart.frame[column.name]
+        limit, values = limit | (values <= column.least), values.clip(column.least or every[every > 0].min(), most)
     is_flat = chart.kind == "dots"
     edge = panel.get_yaxis_transform() if is_flat else panel.get_xaxis_transform()
     look: dict[str, Any] = {"color": style.colour, "zorder": zorder}
@@ -394,43 +328,41 @@ def _draw_values(
     def plot(at: Any, value: Any, **more: Any) -> None:
         panel.plot(*((value, at) if is_flat else (at, value)), **look | more)
 
-    if chart.kind == "lines":
-        plot(places, values, linestyle=style.line, linewidth=style.width)
-    for these, face in ((~limit, {}), (limit, {"markerfacecolor": "white"})) if marker else ():
-        plot(places[these], values[these], marker=marker, linestyle="none", **face)
+    plot(
+        places,
+        values,
+        marker=marker,
+        linestyle=style.line if chart.kind == "lines" else "none",
+        linewidth=style.width,
+        drawstyle="steps-post" if chart.steps else "default",
+        label=plain(style.meaning),
+    )
+    if marker and limit.any():
+        plot(places[limit], values[limit], marker=marker, linestyle="none", **HOLLOW)
+        _name(panel, "upper limit", marker="o", **HOLLOW)
     if column.low and column.high:
         low, high = (points[end].to_numpy(float) for end in (column.low, column.high))
         if log:
-            low, high = np.maximum(low, 1e-300), np.where(np.isinf(high), values * UNLIMITED, high)
+            low, high = np.maximum(low, SMALLEST), np.minimum(high, LARGEST)
         known = np.isfinite(values + low + high) & ~limit
+        if known.any():
+            mark = "s" if chart.band else "_" if is_flat else "|"
+            _name(panel, column.ends, marker=mark, markersize=9, alpha=0.3 if chart.band else 1.0)
         if chart.band:
             low, high = (np.where(known, end, np.nan) for end in (low, high))
             panel.fill_between(places, low, high, color=style.colour, alpha=0.18, linewidth=0, zorder=2)
         else:
             (panel.hlines if is_flat else panel.vlines)(places[known], low[known], high[known], linewidth=1.0, **look)
-    if is_zero.any():  # below every value of the axis
-        plot(
-            places[is_zero],
-            np.full(is_zero.sum(), 0.03),
-            marker=marker or "o",
-            linestyle="none",
-            transform=edge,
-            markerfacecolor="white",
-        )
-    if is_cut.any():
+    if is_cut.any():  # beside the panel, above the values that were cut before
         last = int(np.nanargmax(np.where(is_cut, given, np.nan)))
-        at = (values[last], places[last]) if is_flat else (places[last], values[last])
-        down = 3 + 9 * sum(text.get_gid() == "cut" for text in panel.texts)
-        where: Any = {"xytext": (0, 4), "ha": "center"} if chart.arrow else {"xytext": (4, -down), "va": "top"}
-        panel.annotate(
-            number(given[last]) + " ↑" * (not chart.arrow),
-            at,
-            textcoords="offset points",
-            color=style.colour,
-            gid="cut",
-            **where,
-        )
+        cuts = [text.get_text() for text in panel.texts if text.get_gid() == "cut"]
+        label = f"{number(given[last])} {'→' if is_flat else '↑'}"
+        at, shift = ((1, places[last]), (2, -3)) if is_flat else ((places[last], 1), (0, 2 + CUT * len(cuts)))
+        if label not in cuts:
+            panel.annotate(label, at, shift, xycoords=edge, textcoords="offset points", color=style.colour, gid="cut",
+                           ha="left" if is_flat else "center", annotation_clip=False)  # fmt: skip
     if lost.any():
+        _name(panel, chart.failed_name, marker="x")
         plot(places[lost], np.full(lost.sum(), 0.97), marker="x", linestyle="none", transform=edge, markersize=5,
              markeredgewidth=1.4, clip_on=False)  # fmt: skip
 
@@ -445,12 +377,13 @@ def _draw_dots(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, 
     log = _is_log(x, values[x.name])
     if chart.join:
         for category, points in part.groupby(part[y.name].astype(str), sort=False):
-            ends = points[x.name].clip(x.least).to_numpy(float)
-            ends = ends[np.isfinite(ends) & ((ends > 0) | (not log))]
-            if len(ends) > 1:
-                shade = styles[str(points[chart.series].iloc[-1])].colour if chart.series else "#000000"
-                look: dict[str, Any] = {"color": shade, "alpha": 0.45, "linewidth": 1.8, "zorder": 1}
-                panel.hlines(place[str(category)], ends.min(), ends.max(), **look)
+            ends = points[x.name].clip(x.least)
+            look: dict[str, Any] = {
+                "color": styles[str(points[chart.series].iloc[-1])].colour,
+                "alpha": 0.45,
+                "linewidth": 1.8,
+            }
+            panel.hlines(place[str(category)], ends.min(), ends.max(), zorder=1, **look)
     is_spread = not chart.join and part[y.name].nunique() < len(part)
     for order, (series, style) in enumerate(styles.items()):
         points = part[part[chart.series].astype(str) == series] if chart.series else part
@@ -474,22 +407,20 @@ def _draw_grid(
     has_text = chart.cell and min(0.8 * 72 * room, SIZE * 0.92 * room / max(widest, 0.1)) >= SIZE - 1
     for line in part.to_dict("records"):
         at = names.index(_category(line[x.name])), place[_category(line[y.name])]
-        face = styles[str(line[chart.level])].colour
-        panel.add_patch(Rectangle((at[0] - 0.5, at[1] - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=0.8))
+        face, name = styles[str(line[chart.level])].colour, plain(styles[str(line[chart.level])].meaning)
+        panel.add_patch(
+            Rectangle((at[0] - 0.5, at[1] - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=0.8, label=name)
+        )
         if has_text:  # smaller ones would not be readable
             text = plain(str(line[chart.cell]))
             panel.text(*at, text, ha="center", va="center", color=ink_on(face), fontsize=SIZE - 1)
-    if chart.limit:
-        heights = pd.Series(
-            {value: place[_category(value)] for value in sorted(part[y.name].dropna().unique())}, dtype=float
-        )
-        ends = part.groupby(x.name)[chart.limit].first()
-        ends = ends[(ends > 0) & np.isfinite(ends)]
-        if len(heights) > 1 and len(ends):
-            slope = (len(heights) - 1) / math.log(heights.index[-1] / heights.index[0])
-            panel.plot(
-                [names.index(_category(at)) for at in ends.index], np.log(ends / heights.index[0]) * slope, **LIMIT
-            )
+    if len(part[[x.name, y.name]].drop_duplicates()) < len(names) * len(place):
+        _name(panel, f"blank: {chart.failed_name}", marker="s", **HOLLOW)
+    ends = part.groupby(x.name)[chart.limit].first() if chart.limit else pd.Series(dtype=float)
+    levels = part[y.name].drop_duplicates()
+    steps = [(levels <= end).sum() - 0.5 if 0 < end < math.inf else math.nan for end in ends]
+    if np.isfinite(steps).any():  # along the edges of cells, since it crosses no number there
+        panel.stairs(steps, np.arange(len(steps) + 1) - 0.5, baseline=None, label=chart.limit_name, **LIMIT)
     panel.set_xlim(-0.5, len(names) - 0.5)
     labels, step, angle = [_wrapped(name, room - 0.06, r"_,\[ =") for name in names], 1, 0
     widest = max(map(_text_width, labels))

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -83,8 +83,8 @@ def constants(rows: pd.DataFrame, groups: pd.Series, names: Sequence[str]) -> pd
 
 
 def distinguishing_columns(
-    rows: pd.DataFrame, groups: pd.Series, names: Sequence[str], always: Sequence[str] = ("scene",)
-) -> list[str]:
+    rows: pd.DataFrame, groups: pd.Series, names: Iterable[Any], always: Sequence[Any] = ("scene",)
+) -> list[Any]:
     """Return the columns, of ``names``, that distinguish the groups, and the columns ``always``.
 
     A column is added only if the columns before it do not distinguish all groups that it does.

@@ -8,7 +8,7 @@ from typing import Any
 
 from bench.report.text import one_line
 
-PALETTE = ("#0072B2", "#000000", "#D55E00", "#009E73", "#CC79A7", "#C88031", "#3598D9", "#7406BE")
+PALETTE = ("#0072B2", "#000000", "#D55E00", "#009E73", "#CC79A7", "#6E6200", "#009FBE", "#7406BE")
 """Colours that colour-blind readers can distinguish, with contrasts above 3 on white (Okabe and Ito, the light ones replaced)."""
 MARKERS = "osD^vPX*"
 VARIANTS = ("-", (0, (4, 1.5)), (0, (1, 1.2)), (0, (6, 1.5, 1, 1.5)))

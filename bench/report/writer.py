@@ -45,7 +45,7 @@ def write(experiment: Experiment, views: Views, drawn: Sequence[tuple[Chart, Seq
 
 
 def drawings(experiment: Experiment, views: Views) -> list[tuple[Chart, list[Figure]]]:
-    """Return the charts with enough values to show something, drawn; those without a title have the experiment's question.
+    """Return the charts with enough values to show something, drawn; the first has the experiment's question as its title.
 
     A chart that is wider than one column of a paper is drawn a second time as wide as that.
     """
@@ -54,7 +54,8 @@ def drawings(experiment: Experiment, views: Views) -> list[tuple[Chart, list[Fig
     drawn = []
     with styled():
         for chart in charts:
-            shown = replace(chart, title=chart.title or experiment.question, styles={**looks, **chart.styles})
+            title = experiment.question * (chart is charts[0]) or chart.title or experiment.question
+            shown = replace(chart, title=title, styles={**looks, **chart.styles})
             figure = draw(shown)
             is_wide = figure.get_figwidth() > NARROW
             drawn.append((chart, [figure, *([draw(shown, is_narrow=True)] if is_wide else [])]))

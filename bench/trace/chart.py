@@ -82,9 +82,10 @@ def chart(trace: Trace) -> Chart:
     return Chart(
         "trace",
         frame,
-        [Column("time", unit="s", log=False)],
+        [Column("time", unit="s")],
         [Column("value", label=" ")],
-        title=trace.title,
+        title="Where along the rollout does the gradient grow?",
+        subtitle=trace.title,
         series="series",
         line="line",
         panel="panel",

@@ -1,4 +1,4 @@
-"""Implicit contact on the central path of the complementarity condition."""
+"""Implicit contact: force and motion agree at the end of a step. Solved on the central path of the complementarity condition."""
 
 from dataclasses import dataclass
 from typing import Any

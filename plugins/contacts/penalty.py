@@ -1,4 +1,4 @@
-"""A spring and damper while bodies overlap."""
+"""Explicit contact: a spring and damper while bodies overlap."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -212,7 +212,7 @@ def _charts(shown: Shown, good: pd.DataFrame) -> list[Chart]:
     }
     return [
         Chart(name, good, [horizon], [y], series="method", panel="problem", across=2,
-              subtitle=f"Batches of {samples} rollouts on one thread, a process per point",
-              text=f"Median and range of the measured calls. A hollow marker is an upper limit: little is known below {SMALL:.0f} MiB.")
-        for name, y in drawn.items()
+              title=f"How much {what} does the gradient of a long rollout take?", subtitle=f"Batches of {samples} rollouts on one thread, median of calls",
+              text=f"Little is known below {SMALL:.0f} MiB.")
+        for what, (name, y) in zip(("memory", "time"), drawn.items(), strict=True)
     ]  # fmt: skip

@@ -46,7 +46,7 @@ DETAILS = (
 LEVELS = {
     "right": Style(PALETTE[3], meaning="+: derivative of its program, and near the model's gradient"),
     "own": Style(PALETTE[0], meaning="o: derivative of its program, which is not near the model"),
-    "noisy": Style(PALETTE[5], meaning="~: derivative of its program, but averages are no better than 0"),
+    "noisy": Style("#e8b96a", meaning="~: derivative of its program, but averages are no better than 0"),
     "open": Style(PALETTE[4], meaning="?: derivative of its program; whether averages are better than 0 is open"),
     "wrong": Style(PALETTE[2], meaning="x: not the derivative of its program, or not finite"),
     "none": Style("0.85", meaning="-: no gradient, or the engine cannot run the scene"),
@@ -230,6 +230,5 @@ def _chart(measured: pd.DataFrame) -> Chart:
     return Chart(
         "engines", frame, [text("place", label="")], [text("method", label="")], "grid",
         level="level", cell="cell", styles=LEVELS, height=0.3, across=1,
-        subtitle="Number: model error, the relative distance from the model's gradient. Blank: not supported",
-        text="A cell per engine and scene (rigid: with the law impulse).",
+        subtitle="number: relative distance from the model's gradient; rigid: with the law impulse", failed_name="not supported",
     )  # fmt: skip

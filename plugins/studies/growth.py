@@ -35,7 +35,19 @@ QUANTILES = {"low": 0.05, "quarter": 0.25, "median": 0.5, "three_quarters": 0.75
 """Quantiles over noise samples, stored for heavy-tailed quantities."""
 ORDERS = {"first_order": "first-order", "zeroth_order": "zeroth-order"}
 RATES = {"stretch": "largest singular value", "spectral": "spectral radius"}
-MEDIAN: dict[str, Any] = {"label": "norm of one gradient", "low": "gradient_low", "high": "gradient_high"}
+MEDIAN: dict[str, Any] = {
+    "label": "norm of one gradient",
+    "low": "gradient_low",
+    "high": "gradient_high",
+    "ends": "5% to 95% of the noise samples",
+}
+MEANING = {
+    "exploding": "explodes",
+    "polynomial": "grows as a power",
+    "vanishing": "vanishes",
+    "open": "open: growth not certain",
+}
+"""What a verdict says of a curve."""
 VERDICT = (
     text("problem"),
     text("verdict", "what the norms do along the horizon"),
@@ -160,8 +172,8 @@ class Growth(StudyPackage):
         )
         chart = Chart(
             "growth", good, [shown.column("time_horizon", log=True)], [shown.column("gradient_median", log=True)], panel="problem",
-            across=5, height=1.9, band=True, panel_notes=dict(zip(lines["problem"], lines["verdict"], strict=True)),
-            text="Median over noise samples, and 5% to 95% of them. On these axes a power law is straight and an exponential bends upwards.",
+            across=5, height=1.9, band=True, panel_notes=dict(zip(lines["problem"], lines["verdict"].map(MEANING), strict=True)),
+            subtitle="median over noise samples", text="On these axes a power law is straight and an exponential bends upwards.",
         )  # fmt: skip
         named = shown.arranged.rows.assign(problem=shown.rows["problem"]).fillna({"problem": ""})
         return Views([answers, cells], [chart], named)

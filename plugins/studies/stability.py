@@ -443,7 +443,7 @@ def charts(cells: pd.DataFrame) -> list[Chart]:
     worst = frame["error_share"].fillna(math.inf).where(frame["level"] != "open", -1.0)
     frame = frame.iloc[worst.argsort(kind="stable")[::-1]].drop_duplicates(["problem", "dt", "stiffness"]).sort_index()
     frame = frame[frame["problem"] == frame.groupby("step", sort=False)["problem"].transform("first")]
-    grades, looks = graded(frame["error_share"], EDGES, lambda end: f"{100 * end:g}%")
+    grades, looks = graded(frame["error_share"], EDGES, "error {}".format, lambda end: f"{100 * end:g}%")
     frame["grade"] = frame["level"].where(frame["level"].isin(LOST), grades)
     frame["cell"] = ["" if e != e else f"<{100 * min(EDGES):g}" if e < min(EDGES) else number(100 * e) if e < 10 else ">999"
                      for e in frame["error_share"]]  # fmt: skip

@@ -222,6 +222,6 @@ def _dumbbells(shown: Shown, trapped: pd.DataFrame) -> Chart:
         "three_errors", errors.assign(series=errors["series"].mask(is_trap, TRAP)).reset_index(drop=True),
         [Column("error", label="relative error", least=1e-4, log=True, above_one="larger than the gradient")],
         [text("law", label="")], "dots", series="series", panel="panel", styles=STYLES, join=True, across=2, height=0.2,
-        subtitle="At the smallest time step." if shown.over else "",
+        subtitle="at the smallest time step" if shown.over else "",
         text="The longer the line, the better a wrong gradient passes a check against differences of its own cost.",
     )  # fmt: skip

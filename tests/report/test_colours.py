@@ -1,5 +1,6 @@
 """The palette as a reader without green cones sees it (deuteranopia), and estimators beyond its length."""
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -81,12 +82,11 @@ def test_a_name_has_one_colour_in_all_charts_of_an_experiment():
     names = ["cma_es", "fobg, adam", "ppo"]
     charts = [
         Chart(str(turn), pd.DataFrame({"x": [1.0] * 3, "name": names[turn:] + names[:turn]}), [Column("x")], [Column("x")], "points",
-              series="name", styles=method_styles(["fobg, adam"]))
+              series="name", title=str(turn), styles=method_styles(["fobg, adam"]))
         for turn in range(3)
     ]  # fmt: skip
-    found = [
-        {line.get_label(): line.get_color() for line in figure.legends[0].get_lines()}
-        for _, (figure,) in writer.drawings(experiment(), Views(charts=charts))
-    ]
+    figures = [figure for _, (figure,) in writer.drawings(replace(experiment(), question="Why?"), Views(charts=charts))]
+    assert [figure.texts[0].get_text() for figure in figures] == ["Why?", "1", "2"], "the main chart has the question"
+    found = [{line.get_label(): line.get_color() for line in figure.legends[0].get_lines()} for figure in figures]
     assert found == found[:1] * 3
     assert len(set(found[0].values())) == 3

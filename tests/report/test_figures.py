@@ -3,8 +3,7 @@
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from bench.report import draw, figures, scales
-from bench.report.style import width_in_inches
+from bench.report import figures, scales
 
 
 def half_a_pixel(shift):
@@ -28,11 +27,3 @@ def test_one_value_on_a_logarithmic_axis_has_its_label():
     panel = Figure().subplots()
     scales.log_axis(panel, "x", 2.0, 4.5, [3.0])
     assert list(panel.get_xticks()) == [3.0]
-
-
-def test_a_title_without_spaces_breaks_after_commas_and_slashes():
-    name = "mjcf[action_scale=1,file=gymnasium:envs/mujoco/assets/half_cheetah.xml,substeps=5]"
-    lines = draw._wrapped(name, 2.0).split("\n")
-    assert "".join(lines) == name
-    assert all(width_in_inches(line) <= 2.0 for line in lines)
-    assert draw._wrapped("two_balls, T=60", 2.0) == "two_balls, T=60"

@@ -332,24 +332,25 @@ def test_time_to_an_error_is_drawn_per_backend_that_is_compared_and_with_what_ne
     ]
     given = {"sweep": {"samples": [16, 64, 256, 1024]}, "compares": {"backends": ["jax", "mjx"]}}
     chart = charts_of(cells, **given)["speed_accuracy"]
-    assert (chart.y[0].name, chart.panel) == ("backend", "problem"), "the backends of a problem are rows of one panel"
-    frame = chart.frame.set_index(["backend", "series"])
-    assert frame.loc[("mjx", "fobg"), "cost"] == pytest.approx(0.1, rel=0.05)
-    assert frame.loc[("jax", "fobg"), "cost"] == pytest.approx(1e-3, rel=0.05)
-    assert frame.loc[[("jax", "inverse_variance"), ("mjx", "inverse_variance")], "lost"].all()
+    assert (chart.kind, chart.panel, chart.failed_name) == ("grid", "backend", "not known to be reached")
+    found = {row["backend"]: (row["series"], row["cell"], row["grade"]) for row in chart.frame.to_dict("records")}
+    assert found == {
+        "jax": ("fobg", "1 ms", "first, or tied with it"),
+        "mjx": ("fobg", "100 ms", "10 or more times the first"),
+    }
 
 
-def test_two_values_of_an_axis_are_joined_by_an_arrow():
-    cells = [
-        one | {"rmse_rel": one["rmse_rel"] * (100 if one["stiffness"] == 1e4 else 1)}
-        for one in along({"jax": (0.1, 1e-3)})
-    ]
-    chart = charts_of(cells, compares={"stiffness": [1e2, 1e4], "estimators": ["fobg"]})["contrast"]
-    assert chart.frame["stiffness"].tolist() == [1e2, 1e4]
-    assert chart.frame["arrow"].nunique() == 1
+def test_the_contact_laws_that_an_experiment_compares_are_lines_and_samples_cost_time():
+    """How much longer implicit contact takes with few and with many samples was asked, and the time to an error drawn."""
+    laws = "penalty", "complementarity[kappa=1e-06]"
+    cells = [cell(0.1, 0.09, 0.11, samples=n, contact=law, time_s=1e-5 * n) for n in (1, 10, 100) for law in laws]
+    given = {"sweep": {"samples": [1, 10, 100]}, "compares": {"contacts": ["penalty", "complementarity"]}}
+    chart = charts_of(cells, **given)["time_samples"]
+    assert (chart.y[0].name, list(chart.styles)) == ("time_s", [*laws])
+    assert chart.styles[laws[1]].meaning == "complementarity: implicit contact"
 
 
-def test_below_the_errors_of_an_arrow_are_the_costs_of_the_same_rollouts():
+def test_two_values_of_an_axis_are_joined_by_an_arrow_and_below_are_the_costs_of_the_same_rollouts():
     """That costs look normal where a gradient is off by 1e5 was said, and not drawn. They are of rows that use costs."""
     given = {"sweep": {"stiffness": [1e2, 1e3, 1e4]}, "compares": {"stiffness": [1e2, 1e4], "estimators": ["fobg"]}}
     cells = along({"jax": (0.1, 1e-3)})
@@ -358,11 +359,13 @@ def test_below_the_errors_of_an_arrow_are_the_costs_of_the_same_rollouts():
              for one in along({"jax": (0.2, 1e-3)}, estimator="reinforce")]  # fmt: skip
     chart = charts_of([*cells, *costs], **given)["contrast"]
     assert chart.frame["series"].unique().tolist() == ["fobg"]
-    assert chart.frame["cost"].tolist() == [1e2, 1e4]
+    assert chart.frame["cost"].tolist() == chart.frame["stiffness"].tolist() == [1e2, 1e4]
     with styled():
-        errors, below = draw(chart).axes
+        figure = draw(chart)
+    errors, below = figure.axes
     assert errors.get_xlim() == below.get_xlim()
-    assert below.get_ylabel() == "cost of a rollout"
+    assert below.get_title("left").endswith("costs of the same rollouts, changed by at\nmost 200%")
+    assert "95% of the rollouts" in [text.get_text() for text in figure.legends[0].get_texts()]
 
 
 def test_what_a_command_line_chooses_is_drawn_whatever_the_file_compares():

@@ -385,7 +385,7 @@ def test_own_measurements_have_no_coverage_to_show():
     """With a record of one's own the truth is unknown: neither error nor coverage is drawn, and no fit counts as lost."""
     given, rows = stored("identify")
     drawn = given.study.views(given, rows).charts[0].frame
-    first = drawn[drawn["panel"] == drawn["panel"].iloc[0]]  # a cross beside a coverage would look like a good one
+    first = drawn[drawn["series"] == drawn["series"].iloc[0]]  # a cross beside a coverage would look like a good one
     assert drawn["failed"].sum() == (first["converged"] == 0).sum() > 0
     gone = {
         name: [[math.nan] * len(v) for v in rows[name]]

@@ -13,7 +13,6 @@ from helpers import unmeasured
 
 import bench
 from bench.experiment import config
-from bench.experiment.axes import table
 from bench.experiment.columns import COMMON
 from bench.experiment.grid import cells
 from bench.gradient import EPS
@@ -152,12 +151,9 @@ def test_twins_of_a_swept_scene_are_panels_of_their_own():
     )
     shown = given.study.views(given, rows)
     [chart], [lines] = shown.charts, shown.tables
-    drawn = chart.plotted()
-    assert list(dict.fromkeys(drawn["problem"])) == ["pendulum, horizon=2", "pendulum, horizon=3"], "the worst is first"
-    assert list(drawn["gradient_difference_rel"]) == [0.0, 2e-3, 1e-3, 1e-3]
+    assert list(chart.frame["problem"].unique()) == ["pendulum, horizon=2", "pendulum, horizon=3"], "the worst is first"
     assert chart.x[0].least == FLOOR, "0 is at the lower edge"
     assert list(readable(lines)["horizon [steps]"]) == ["2", "2", "3", "3"]
-    assert list(table(given, rows))[-2:] == ["study", "parameters"]
 
 
 def test_two_engines_on_a_robot_part_in_a_step(tmp_path):

@@ -212,23 +212,6 @@ def median_interval(values: np.ndarray) -> tuple[float, float, float]:
     return float(np.median(values)), low, high
 
 
-def relative_times(lines: pd.DataFrame) -> pd.DataFrame:
-    """Return the points of the chart: by class, kind and dose, median error and updates over the best gradient's.
-
-    Medians are over scenes, with their intervals. Where half of the scenes miss the target the time is missing and
-    ``is_missed`` is true.
-    """
-    part = lines[(lines["target"] == MAIN) & (lines["kind"] != BEST)]
-    part = part.assign(size=part["dose"].fillna(part["samples"]), relative=part["median"] / part["floor"])
-    keys = ["scene_class", "kind", "method", "size"]
-    result = []
-    for key, own in part.groupby(keys, sort=False):
-        value, low, high = median_interval(own.groupby("scene")["relative"].median().to_numpy())
-        is_missed = not math.isfinite(value)
-        result.append([*key, own["error"].median(), math.nan if is_missed else value, low, high, is_missed])
-    return pd.DataFrame(result, columns=[*keys, "error", "time", "time_low", "time_high", "is_missed"])
-
-
 # ------------------------------------------------------------------------------------------------------- costs only
 
 

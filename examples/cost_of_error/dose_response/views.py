@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 
@@ -11,20 +13,16 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Mark, Style, Table, Views
 from bench.report.colours import method_styles
 from bench.report.style import PALETTE
-from bench.report.text import counted
 
 from . import analysis
-from .analysis import BEST, BIAS, COSTS_ONLY, MAIN, RANDOM
+from .analysis import BEST, COSTS_ONLY, MAIN
 
-STYLES = {
-    RANDOM: Style(PALETTE[0], "o"),
-    BIAS: Style(PALETTE[2], "^"),
-}
-"""The errors that are drawn; the tables have the others and the natural methods."""
 NO_VERDICT = Style("#767676")
-VERDICTS = {"above 1": Style(PALETTE[2]), "below 1": Style(PALETTE[0]), "not known": NO_VERDICT}
-ENOUGH = 6
-"""Fewest scenes with an interval."""
+VERDICTS = {
+    "above 1": Style(PALETTE[2], "D", meaning="takes more for certain"),
+    "below 1": Style(PALETTE[0], "s", meaning="takes fewer for certain"),
+    "not known": replace(NO_VERDICT, meaning="not known"),
+}
 CLASS, PROBLEMS, SCENES = (
     text("scene_class", label="class"),
     Column("problems", format="setting"),
@@ -66,8 +64,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         Table("dose_response", csv_table(experiment, rows), [], files=["csv"]),
         _problems(table),
     ]  # fmt: skip
-    points = analysis.relative_times(lines[lines["scene_class"].isin(pairs["scene_class"])])
-    charts = ([_chart(points, pairs)] if several else [_ratios(together)]) if len(points) else []
+    charts = [_ratios(together)] if len(together) else []
     if len(beside):  # then the question is what such methods take
         tables, charts = [_reached(beside), *tables[2:]], [_reached_chart(beside)]
     return Views([one for one in tables if len(one.frame)], charts)
@@ -86,32 +83,15 @@ def _problems(table: pd.DataFrame) -> Table:
     return Table("problems", frame, columns, "Problems", PROBLEM_NOTES)
 
 
-def _chart(points: pd.DataFrame, pairs: pd.DataFrame) -> Chart:
-    """Return the cost of an error: updates over the best gradient's against the relative error, a panel per class."""
-    points = points[points["kind"].isin(STYLES)].assign(time_low=lambda f: f["time_low"].where(f["time_low"] > 0))
-    sizes = pairs[pairs["target"] == MAIN].groupby("scene_class")[["problems", "scenes"]].max()
-    return Chart(
-        "cost_of_error", points.sort_values("method", kind="stable"), [Column("error", label="relative error", log=True)],
-        [interval("time", label="updates / best gradient's", log=True)],
-        kind="points", series="method", panel="scene_class", styles=STYLES, failed="is_missed", across=3, height=2.0,
-        marks=[Mark("the best gradient", 1.0, axis="y")],
-        panel_notes={row.Index: f"{row.problems} problems of {counted(row.scenes, 'scene')}" + f", fewer than {ENOUGH}: no intervals" * (row.scenes < ENOUGH)
-                     for row in sizes.itertuples()},
-        subtitle=f"To 1/{MAIN:g} of the first regret, each method at its best rate. Cross: half of the scenes miss it. "
-        "A bar to the top: no upper end",
-        text="Planted errors: noise, and a bias. Medians over scenes, with 95% intervals where there are six. The error is the median over ten thetas that all methods of a problem share.",
-    )  # fmt: skip
-
-
 def _ratios(pairs: pd.DataFrame) -> Chart:
     """Return the ratios whose interval has an end: a row per comparison."""
     frame = pairs[(pairs["ratio_low"] > 0) | np.isfinite(pairs["ratio_high"])]
     frame = frame.assign(ratio_low=frame["ratio_low"].where(frame["ratio_low"] > 0), is_missed=np.isinf(frame["ratio"]))
     return Chart(
-        "ratios", frame, [interval("ratio", label="times the updates", log=True)],
+        "ratios", frame, [interval("ratio", label="times the updates, or rollouts between orders and samples", log=True)],
         [text("comparison", label="")], "dots", series="verdict", styles=VERDICTS, marks=[Mark("the same", 1.0)], failed="is_missed",
-        height=0.28, subtitle=f"To 1/{MAIN:g} of the first regret, over the best gradient. Cross: half of the scenes miss it",
-        text="Medians over scenes with 95% intervals. Left of the line is fewer updates.",
+        failed_name="more than half of the scenes miss the target", height=0.24,
+        subtitle=f"to 1/{MAIN:g} of the first regret, median over scenes; a single error is over the best gradient, a pair over its second",
     )  # fmt: skip
 
 
@@ -127,10 +107,10 @@ def _reached(known: pd.DataFrame) -> Table:
 
 def _reached_chart(known: pd.DataFrame) -> Chart:
     methods = dict.fromkeys(known.sort_values("kind", key=lambda kinds: kinds == COSTS_ONLY, kind="stable")["method"])
-    looks = method_styles(methods) | {BEST: NO_VERDICT}
+    looks = method_styles(methods) | {BEST: replace(NO_VERDICT, meaning=f"{BEST}: without noise")}
     return Chart(
-        "reached", known, [Column("evaluations", label="rollouts and gradients to 1/100", low="fewest", high="most", log=True)],
-        [text("problem", label="")], "dots", series="method", styles=looks, failed="missed", height=0.55,
-        subtitle=f"To 1/{MAIN:g} of the first regret, each method at its best rate. Cross: most searches miss it",
+        "reached", known, [Column("evaluations", label="rollouts and gradients to 1/100", low="fewest", high="most", ends="range of the searches", log=True)],
+        [text("problem", label="")], "dots", series="method", styles=looks, failed="missed", failed_name="most searches miss it", height=0.55,
+        subtitle=f"to 1/{MAIN:g} of the first regret, each method at its best rate, median of searches",
         text="Best gradient: without noise, or the mean of many costs times scores where the cost jumps. A dot is the median over the searches of a method and a bar their range. A gradient counts as one rollout.",
     )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -18,9 +19,10 @@ from bench.experiment.parameters import PROBLEM
 from bench.experiment.views import Chart, Mark, Style
 from bench.model import SURROGATE, registry
 from bench.report.colours import graded, method_styles
-from bench.report.problems import ProblemRows, problem_numbers, split_by_problem
+from bench.report.names import setting, short_names
+from bench.report.problems import ProblemRows, joined, problem_numbers, split_by_problem, titled
 from bench.report.style import MARKERS, colour
-from bench.report.text import axis_value, counted, number
+from bench.report.text import axis_value, counted, number, short_duration
 from bench.report.views import (
     Arranged,
     attempted,
@@ -32,13 +34,16 @@ from bench.report.writer import LEAST
 
 from .columns import COLUMNS
 from .comparisons import FAILS, NO_RESULT
-from .time_to_accuracy import COSTS, ROLLOUTS, SAMPLES, TARGETS, TIME, with_known
+from .time_to_accuracy import ROLLOUTS, SAMPLES, TARGETS, TIME, with_known
 from .time_to_accuracy import methods as methods_by_cost
 
 FLOOR = 1e-4
 """Relative errors below this are drawn here, as upper limits."""
 GRADES = {0.1: "#08519c", 0.3: "#6baed6", 1.0: "#d6e6f4", 10.0: "#fdae61", math.inf: "#c51b1b"}
 """Upper ends of the grades of an error, and their colours."""
+BEHIND = {3.0: "#6baed6", 10.0: "#d6e6f4", math.inf: "#fdae61"}
+"""Upper ends of the grades of a factor to the first method, and their colours."""
+FIRST, NOTHING = "first, or tied with it", Style("#f2f2f2")
 PANELS = 4
 """Most problems of a chart along an axis."""
 RMSE = Column(
@@ -49,7 +54,7 @@ BIAS = Column(
     "bias_shown", label="relative bias", low="bias_from", high="bias_to", limit="bias_limit", log=True, least=FLOOR,
     above_one="larger than the gradient",
 )  # fmt: skip
-COST = interval("cost", label="cost of a rollout", log=False)
+COST = interval("cost", log=False, ends="95% of the rollouts")
 SECONDS = replace(COLUMNS.by_name["time_s"], label="time of one estimate", log=True)
 FASTEST = "each estimator on its fastest backend"
 ESTIMATOR = text("series", label="")
@@ -65,22 +70,20 @@ def charts(
     subtitle = _conditions(shown)
     swept = shown.swept()
     order = sorted(swept, key=lambda a: (-swept[a], a.column not in ("stiffness", "samples")))
+    is_timed = shown.rows["time_s"].notna().any() and "contacts" not in shown.experiment.compares
     along = [
-        _along(labelled, axis, subtitle)
-        if axis.column != "samples" or best.empty
-        else _cost_of_accuracy(shown, best, subtitle)
+        _cost_of_accuracy(shown, best, subtitle)
+        if axis.column == "samples" and is_timed
+        else _along(labelled, axis, subtitle)
         for i, axis in enumerate(order)
         if not any(axis.column in other.moves for other in order[:i])  # axes that step together have one chart
     ]
-    if shown.rows["time_s"].notna().any():
-        along = [_contrast(labelled, subtitle), *along]
-    if not swept and shown.rows["backend"].nunique() > 1:
-        along += [_error_and_cost(labelled, subtitle)]
+    along = [_contrast(labelled, subtitle), *along]
     is_grid = (methods[["setting", "estimator"]].nunique() > 1).all()
-    if best.empty and max(swept.values(), default=0) < LEAST and is_grid:
+    if max(swept.values(), default=0) < LEAST and is_grid:
         along = [_estimators(methods), *along]
-    drawn = [chart for chart in along if chart is not None]
-    names = [name for chart in drawn if chart.series for name in chart.frame[chart.series]]
+    drawn = [*filter(None, along)]
+    names = [name for chart in drawn for name in chart.frame["series"]]
     styles = method_styles(dict.fromkeys([*labelled.rows["series"], *names]))
     return [chart if chart.styles else replace(chart, styles=styles) for chart in drawn]
 
@@ -92,11 +95,11 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows with the columns that charts draw: errors in units of |grad J|, and labels of points and lines."""
     norm = rows["reference_norm"].where(rows["reference_norm"] > 0)
     limit = ~(rows["bias_low"] > 0)
-    error, low, high, is_limit = shown_rmse(rows)
+    error, low, high, is_limit = (pd.Series(part, rows.index) for part in shown_rmse(rows))
     values = {
-        "rmse_rel": pd.Series(error, rows.index),
-        "rmse_low": pd.Series(low, rows.index),
-        "rmse_high": pd.Series(high, rows.index),
+        "rmse_rel": error,
+        "rmse_low": low,
+        "rmse_high": high,
         "bias_shown": rows["bias"].where(~limit, rows["bias_high"]) / norm,
         "bias_from": rows["bias_low"] / norm,
         "bias_to": rows["bias_high"] / norm,
@@ -108,7 +111,6 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
         rmse_limit=is_limit,
         bias_limit=limit,
         series=estimator_labels(rows),
-        line=rows["backend"] + " " + rows["dtype"],
         failed=~good,
     )
 
@@ -116,7 +118,7 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
 def _conditions(shown: Arranged) -> str:
     """Return what all panels share: samples, medians over seeds, surrogate gradients."""
     rows = shown.rows
-    parts = [str(rows["scene"].iloc[0])] if rows["scene"].nunique() == 1 else []
+    parts = [*short_names(rows["scene"]).values()] if rows["scene"].nunique() == 1 else []
     parts += [f"{n:g} samples" for n in rows["samples"].unique()] if rows["samples"].nunique() == 1 else []
     seeds = rows["seed"].nunique()
     parts += [f"medians over {seeds} seeds"] if seeds > 1 else []
@@ -139,42 +141,53 @@ def _along(
     if not problems:
         return None
     drawn, notes = choose_problems(problems)
-    backends = shown.experiment.compares.get("backends", ())
-    frame = pd.concat([_lines(problem, backends) for problem in problems], ignore_index=True)
+    compares = shown.experiment.compares
+    compared = next((column for column in ("backend", "contact") if f"{column}s" in compares), "")
+    series = compares.get(f"{compared}s", ())
+    frame = pd.concat([_lines(problem, compared, series) for problem in problems], ignore_index=True)
     # most estimators of a chart along an axis, where the experiment does not name them
-    names = shown.experiment.compares.get("estimators") or list(dict.fromkeys(frame["label"]))[:6]
+    names = compares.get("estimators") or list(dict.fromkeys(frame["label"]))[:6]
     total = frame["label"].nunique()
-    shares = [f"{len(names)} of {total} estimators"] if len(names) < total else []
-    for column, kept in (("label", names), ("panel", [problem.title() for problem in drawn])):
+    shares = [f"{len(names)} of {total} estimators"] * (len(names) < total)
+    for column, kept in (("label", names), ("problem", [problem.title() for problem in drawn])):
         frame = frame[frame[column].isin(kept)]
         frame = frame.iloc[frame[column].map(kept.index).argsort(kind="stable")]
-    if backends:
-        frame = frame.assign(panel=frame["panel"] + ", " + frame["label"], series=frame["backend"])
     marks = [Mark(f"beyond the {name}", value, math.inf) for name, value in shown.marks(axis).items()]
-    x = Column("x", label=axis.title, format="setting")
+    stem, what, y = "bias_variance", "error", [RMSE, BIAS]
+    if axis.column == "samples" and compared == "contact":
+        stem, what, y = "time", "time", [SECONDS]
     return Chart(
-        "bias_variance_" + re.sub(r"\W", "_", axis.column), frame, [x], [RMSE, BIAS], series="series",
-        panel="panel", marks=marks, failed="failed", across=len(names) if backends else len(drawn),
-        height=2.7 if len(drawn) <= 2 else 2.1, styles=_nested(backends),
+        f"{stem}_" + re.sub(r"\W", "_", axis.column), frame, [Column("x", label=axis.title, format="setting")], y, series="series",
+        title=f"How does the {what} of one estimate depend on {axis.column.replace('_', ' ')}?",
+        panel="panel", marks=marks, failed="failed", across=len(names) if compared else len(drawn),
+        height=2.7 if len(drawn) <= 2 else 2.1, styles=_nested(frame["series"].unique() if compared else ()),
         subtitle=", ".join(filter(None, [subtitle, *notes, *shares])),
-        text="Bars are 95% intervals. A hollow marker is an upper limit.",
     )  # fmt: skip
 
 
-def _lines(problem: ProblemRows, backends: Sequence[str]) -> pd.DataFrame:
-    """Return the points of a problem: a line per estimator and backend, those that agree as one unless these are compared."""
-    curves = estimator_curves(problem.rows, None if backends else 0.03)
-    curves = curves[curves["backend"].isin(backends)] if backends else curves
-    if not backends:  # those that differ from the first are named after their backends
-        first = curves["curve"] == curves.groupby("label")["curve"].transform("min")
-        curves = curves.assign(series=curves["label"].where(first, curves["method"]))
-    return curves.assign(panel=problem.title())
+def _lines(problem: ProblemRows, compared: str, names: Sequence[str]) -> pd.DataFrame:
+    """Return the points of a problem: a line per estimator and backend, or per ``compared`` column in a panel per estimator.
+
+    Backends that agree are one line unless they are compared.
+    """
+    curves = estimator_curves(problem.rows, None if compared == "backend" else 0.03).assign(problem=problem.title())
+    if compared:
+        others = joined({name: value for name, value in problem.identity.items() if name != compared})
+        curves = curves[[bool({name, name.partition("[")[0]} & {*names}) for name in curves[compared]]]
+        return curves.assign(
+            series=curves[compared], panel=[", ".join(filter(None, (others, label))) for label in curves["label"]]
+        )
+    # those that differ from the first are named after their backends
+    first = curves["curve"] == curves.groupby("label")["curve"].transform("min")
+    return curves.assign(series=curves["label"].where(first, curves["method"]), panel=problem.title())
 
 
 def _nested(names: Sequence[str]) -> dict[str, Style]:
-    """Return looks in which lines on top of each other are all seen: each later one is thinner."""
-    count = len(names)
-    return {name: Style(colour(i), MARKERS[i], width=1.2 * (count - i)) for i, name in enumerate(names)}
+    """Return looks of backends or contact laws in which lines on top of each other are all seen: each later one is thinner."""
+    return {
+        name: Style(colour(i), MARKERS[i], width=1.2 * (len(names) - i), meaning=": ".join(filter(None, (short, _summary(name)))))
+        for i, (name, short) in enumerate(short_names(names).items())
+    }  # fmt: skip
 
 
 def choose_problems(problems: Sequence[ProblemRows]) -> tuple[list[ProblemRows], list[str]]:
@@ -182,122 +195,93 @@ def choose_problems(problems: Sequence[ProblemRows]) -> tuple[list[ProblemRows],
 
     Of problems that differ only in numbers, the first stands for all.
     """
-    if len(problems) <= 2:
-        return list(problems), []
     first: dict[str, ProblemRows] = {}
-    for problem in problems:
-        first.setdefault(", ".join(str(v) for v in problem.identity.values() if isinstance(v, str)), problem)
-    chosen = list(first.values())[:PANELS]
-    if len(chosen) == len(problems):
-        return chosen, []
+    for problem in problems if len(problems) > 2 else ():
+        first.setdefault(joined({k: v for k, v in problem.identity.items() if isinstance(v, str)}), problem)
+    chosen = list(first.values())[:PANELS] or list(problems)
     numbers = {k: v for p in chosen for k, v in p.identity.items() if not isinstance(v, str)}
-    held = ", ".join(f"{name} = {value:g}" for name, value in numbers.items())
-    shares = f"{len(chosen)} of {counted(len(problems), 'problem')}"
-    return chosen, [f"{shares} ({held})" if held else shares]
+    held = ", ".join(setting(name, f"{value:g}") for name, value in numbers.items())
+    shares = f"{len(chosen)} of {counted(len(problems), 'problem')}" + f" ({held})" * bool(held)
+    return chosen, [shares] * (len(chosen) < len(problems))
 
 
 # ----------------------------------------------------------------------------------------------- error and cost
 
 
-def _error_and_cost(shown: Arranged, subtitle: str) -> Chart | None:
-    """Return error against time where nothing was swept: a point per estimator on its fastest backend, a panel per problem."""
-    parts = []
-    for problem in split_by_problem(shown, None, ("scene", "contact")):
-        rows = with_known(problem.rows, TIME)
-        parts += [_on_fastest(every).assign(panel=problem.title()) for _, every in rows.groupby("series", sort=False)]
-    if not parts:
-        return None
-    return Chart(
-        "speed_accuracy", pd.concat(parts, ignore_index=True), [SECONDS], [RMSE], "points", series="series",
-        panel="panel", line="line", arrow="series", across=3, height=1.9, subtitle=", ".join(filter(None, [subtitle, FASTEST])),
-    )  # fmt: skip
-
-
 def _contrast(shown: Arranged, subtitle: str) -> Chart | None:
-    """Return error against time at two values of an axis, joined by arrows, as the experiment's ``compares`` names them."""
+    """Return error against time at two values of an axis, joined by arrows, as the experiment's ``compares`` names them.
+
+    A point is an estimator on its fastest backend, a panel a scene with a contact law, with the costs of the same rollouts below.
+    """
     program = problem_numbers(shown.rows, PROBLEM)
     # cells of one program have the same costs, and those that use costs store them
     cost = shown.rows[[COST.name, COST.low, COST.high]].groupby(program).transform("first")
-    rows = with_known(shown.rows.assign(**cost), TIME)
-    joined_axis: tuple[Axis, Sequence[Any]] | None = None
+    rows = with_known(shown.rows.assign(**cost, panel=titled(shown.rows, ["scene", "contact"])), TIME)
+    along, ends = None, list[Any]()
     for name, values in shown.experiment.compares.items():
         axis = next((axis for axis in shown.axes if name in (axis.column, axis.short)), None)
-        column = (
-            "series" if name == "estimators" else "backend" if name == "backends" else axis.column if axis else name
-        )
+        column = axis.column if axis else {"estimators": "series"}.get(name, name.removesuffix("s"))
         if column not in rows:
-            raise unknown("axis in compares", name, (*shown.numbers, "estimators", "backends"))
+            raise unknown("axis in compares", name, (*shown.numbers, "estimators", "backends", "contacts"))
         rows = rows[rows[column].isin(values)]
-        joined_axis = (axis, values) if len(values) == 2 and axis else joined_axis
-    if joined_axis is None or rows.empty:
+        along, ends = (axis, list(values)) if len(values) == 2 and axis else (along, ends)
+    if rows.empty or along is None:
         return None
-    along, (start, end) = joined_axis
-    parts = [_on_fastest(part) for _, part in rows.groupby(["series", "contact"], sort=False)]
-    frame = pd.concat(parts).sort_values(along.column, key=lambda at: at == end, kind="stable")
+    frame = pd.concat([_on_fastest(part) for _, part in rows.groupby(["series", "panel"], sort=False)])
+    frame = frame.sort_values(along.column, key=lambda at: at == ends[-1], kind="stable")
+    pairs = frame.groupby(["series", "panel"])
     # one program at both settings: what differs is noise
-    frame[TIME] = frame.groupby(["series", "contact"])[TIME].transform("median")
-    frame = frame.assign(arrow=frame["series"] + ", " + frame["contact"], line=frame["contact"].str.partition("[")[0])
+    frame = frame.assign(**{TIME: pairs[TIME].transform("median")}, arrow=frame["series"] + ", " + frame["panel"])
+    moved = ((pairs["cost"].max() - pairs["cost"].min()) / pairs["cost"].mean().abs()).max()
+    below = replace(COST, doc=f"costs of the same rollouts, changed by at most {number(100 * moved)}%")
+    looks = method_styles(frame["series"].unique())
     return Chart(
-        "contrast", frame, [SECONDS], [RMSE, *[COST] * bool(frame["cost"].notna().any())], "points", series="series", line="line",
-        arrow="arrow", height=2.9, own_scales=True,
-        subtitle=", ".join(filter(None, [subtitle, f"arrows: {along.title} {axis_value(start)} to {axis_value(end)}", FASTEST])),
-        text="An arrow joins the same estimator at two settings. Below are the costs of the same rollouts at both, with bars for 95% of them.",
+        "contrast", frame, [SECONDS], [replace(RMSE, low="", high=""), *[below] * bool(moved == moved)], "points", series="series",
+        panel="panel", arrow="arrow", arrow_name=f"{along.column} {' to '.join(f'{end:,g}' for end in ends)} {along.unit}".rstrip(),
+        across=2, height=2.2, own_scales=True, subtitle=", ".join(filter(None, [subtitle, FASTEST])),
+        panel_notes={panel: _summary(law) for panel, law in zip(frame["panel"], frame["contact"], strict=True)},
+        styles={name: replace(look, meaning=f"{short_names(looks)[name]}: {_family(name.partition('[')[0])}") for name, look in looks.items()},
     )  # fmt: skip
+
+
+def _summary(contact: str) -> str:
+    """Return what kind of contact a law has, in the first words of its module."""
+    entry = registry.entries()["contacts"].get(contact.partition("[")[0])
+    doc = (sys.modules[entry.plugin.__module__].__doc__ or "") if entry and entry.plugin else ""
+    return re.split("[:.]", doc)[0].lower()
 
 
 def _on_fastest(rows: pd.DataFrame) -> pd.DataFrame:
     """Return an estimator's rows on its fastest backend, by the median over its settings."""
-    return rows[rows["line"] == rows.groupby("line")[TIME].median().idxmin()]
+    times = rows.groupby(["backend", "dtype"])[TIME].transform("median")
+    return rows[times == times.min()]
 
 
 def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Chart:
-    """Return the cost of each estimator to reach an error: a row per problem, with who is first and by what factor.
+    """Return the time of each estimator to reach an error, as a table whose colours are its factor to the first of each problem.
 
-    Where backends are compared, each problem has a panel with a row per backend.
+    Where backends are compared, each has a panel; else an estimator is on its fastest.
     """
-    kind, target = best["by"].iloc[0], TARGETS[0]
-    backends = shown.experiment.compares.get("backends", ()) if kind == "time" else ()
-    lead = best[(best["by"] == kind) & (best["relative error"] == target)].set_index("problem", drop=False)
-    lines = []
-    for problem in split_by_problem(shown, SAMPLES, ("scene",)):
-        found = methods_by_cost(problem, target, COSTS[kind]) if problem.title() in lead.index else {}
-        for name, needed in found.items():
-            estimator, _, backend = name.partition(" on ")
-            low, high = (needed.cost * math.exp(sign * size) for sign, size in ((-1, needed.down), (1, needed.up)))
-            lines.append({"problem": _with_lead(lead.loc[problem.title()]), "series": estimator, "cost": needed.cost, "low": low, "high": high, "limit": needed.how == "at once",
-                          "lost": not math.isfinite(needed.cost), "backend": backend})  # fmt: skip
-    frame = pd.DataFrame(lines)
-    frame = frame.sort_values("cost").drop_duplicates(["problem", "series", *["backend"] * bool(backends)]).sort_index()
-    frame = frame[frame["backend"].isin(backends or frame["backend"])]
-    label = f"{'time' if kind == 'time' else 'rollouts'} to a relative error of {target:.0%}"
-    cost = Column(
-        "cost",
-        label=label,
-        format="seconds" if kind == "time" else "setting",
-        low="low",
-        high="high",
-        limit="limit",
-        log=True,
-    )
+    target, backends = TARGETS[0], shown.experiment.compares.get("backends", ())
+    lead = best[(best["by"] == "time") & (best["relative error"] == target)].set_index("problem")
+    lines = [
+        {"problem": problem.title(), "series": name.partition(" on ")[0], "backend": name.partition(" on ")[2], "cost": needed.cost,
+         "sign": "<" * (needed.how == "at once"), "leads": name in (lead["fastest"][problem.title()], *lead["tied"][problem.title()])}
+        for problem in split_by_problem(shown, SAMPLES, ("scene",)) if problem.title() in lead.index
+        for name, needed in methods_by_cost(problem, target, TIME).items()
+    ]  # fmt: skip
+    frame = pd.DataFrame(lines).sort_values("cost")
+    frame = frame.drop_duplicates(["problem", "series", *["backend"] * bool(backends)]).sort_index()
+    frame = frame[frame["backend"].isin(backends or frame["backend"]) & np.isfinite(frame["cost"])]
+    factor = frame["cost"] / frame.groupby("problem")["cost"].transform("min")
+    grades, looks = graded(factor, BEHIND, "{} times the first".format, "{:g}".format)
     return Chart(
-        "speed_accuracy" if kind == "time" else "rollouts_accuracy", frame, [cost], [text("backend" if backends else "problem", label="")],
-        "dots", series="series", panel="problem" if backends else "", failed="lost", across=3, height=0.25,
-        subtitle=", ".join(filter(None, [subtitle, "" if backends else FASTEST, "crosses: not known to be reached"])),
+        "speed_accuracy", frame.assign(grade=grades.mask(frame["leads"], FIRST), cell=frame["sign"] + frame["cost"].map(short_duration)),
+        [text("problem", label="")], [ESTIMATOR], "grid", panel="backend" if backends else "", level="grade", cell="cell", across=1,
+        height=0.2, styles={FIRST: Style(GRADES[0.1])} | looks, failed_name="not known to be reached",
+        title=f"Which method reaches an error of {target:.0%} first?",
+        subtitle=", ".join(filter(None, [f"time to a relative error of {target:.0%}", subtitle, "" if backends else FASTEST])),
     )  # fmt: skip
-
-
-def _with_lead(best: Any) -> str:
-    """Return a problem with the first method there, and the factor by which it leads."""
-    if best["fastest"] == "-":
-        return f"{best['problem']}\nnone"
-    others = (
-        f"{number(best['factor'])}x ahead"
-        if best["factor_low"] > 1 and best["factor"] > 0
-        else f"at least {number(best['factor_low'])}x ahead"
-        if best["factor_low"] > 1
-        else "tied"
-    )
-    return f"{best['problem']}\n{best['fastest']}, {others}"
 
 
 # --------------------------------------------------------------------------------------------------- estimators
@@ -305,22 +289,24 @@ def _with_lead(best: Any) -> str:
 
 def _estimators(methods: pd.DataFrame) -> Chart:
     """Return the heat table of errors: estimators by their worst case, in families, against problems."""
+    # of an axis the first value is shown
+    methods = methods.drop_duplicates(["estimator", "problem"])
     worst = methods["error"].where(methods["status"] == "ok", math.inf)
     names = worst.groupby(methods["estimator"], sort=False).max().sort_values(kind="stable").index
     families = {name: _family(name.partition("[")[0]) for name in names}
     order = sorted(names, key=lambda name: list(dict.fromkeys(families.values())).index(families[name]))
     frame = methods.iloc[methods["estimator"].map(order.index).argsort(kind="stable")]
-    at = ", " + frame["axis"] + "=" + frame["at"].map(axis_value)
+    axis, at = frame[["axis", "at"]].iloc[0]
     error, known = frame["error"], np.isfinite(frame["error"])
     marks = frame["status"].where(frame["verdict"] == NO_RESULT, "").mask(frame["verdict"] == FAILS, " fails")
-    grades, looks = graded(error, GRADES, "{:g}".format)
+    grades, looks = graded(error, GRADES, "error {}".format, "{:g}".format)
     return Chart(
         "estimators",
-        frame.assign(panel=frame["estimator"].map(families), series=frame["estimator"], grade=grades.where(known, "no result"), problem=frame["problem"] + at.where(frame["axis"] != "", ""),
-                     cell=(pd.Series(np.where(frame["error_is_limit"], "<", ""), frame.index) + error.map(number)).where(known, marks)),
-        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", level="grade", styles=looks | {"no result": Style("#f2f2f2")},
-        cell="cell", across=1, height=0.2,
-        subtitle="relative RMSE of one estimate, sorted by the worst case; from 1 on the zero estimate is better",
+        frame.assign(panel=frame["estimator"].map(families), series=frame["estimator"], grade=grades.where(known, "no result"),
+                     cell=(frame["error_is_limit"].map({True: "<"}).fillna("") + error.map(number)).where(known, marks)),
+        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", level="grade", styles=looks | {"no result": NOTHING},
+        cell="cell", across=1, height=0.2, title="Where does each estimator win, and where does it fail?", failed_name="cannot be used",
+        subtitle=f"relative RMSE of one estimate{f', {axis} {axis_value(at)}' if axis else ''}, sorted by the worst case; from 1 on the zero estimate is better",
     )  # fmt: skip
 
 

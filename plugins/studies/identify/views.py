@@ -11,10 +11,10 @@ import pandas as pd
 from scipy.stats import chi2
 
 from bench.experiment.axes import table
-from bench.experiment.columns import Column, text
+from bench.experiment.columns import Column, interval, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Mark, Table, Views
-from bench.report.shown import Shown
+from bench.report.shown import Shown, stacked
 
 STATISTICS = (
     "converged", "converged_low", "converged_high", "error", "coverage", "coverage_low", "coverage_high", "hidden",
@@ -147,20 +147,17 @@ def verdicts(lines: pd.DataFrame) -> np.ndarray:
 
 def charts(lines: pd.DataFrame, fits: Sequence[Column]) -> list[Chart]:
     """Return the chart of errors and coverage, or none if no truth is known."""
-    parts, marks = [], []
-    for column, ideal, name in zip(fits, (1.0, LEVEL), ("bound", ""), strict=True):
-        if lines[column.name].notna().any():
-            values = {end: lines[c] for end, c in (("value", column.name), ("low", column.low), ("high", column.high))}
-            parts.append(
-                lines.assign(**values, panel=column.heading, failed=(lines["converged"] == 0) & (name == "bound"))
-            )
-            marks.append(Mark(name, ideal, panel=column.heading))
-    if not parts:
+    drawn = {column.heading: column.name for column in fits if lines[column.name].notna().any()}
+    if not drawn:
         return []
+    frame = stacked(lines, drawn, "value")
+    ideals = zip(fits, (1.0, LEVEL), ("Cramer-Rao bound", f"stated, {LEVEL:.0%}"), strict=True)
+    marks = [Mark(name, ideal, panel=column.heading) for column, ideal, name in ideals]
+    frame = frame.assign(failed=(frame["converged"] == 0) & (frame["series"] == fits[0].heading))
     return [
         Chart(
-            "identify", pd.concat(parts, ignore_index=True), [Column("value", label=" ", low="low", high="high")],
-            [text("problem", label="")], "dots", series="shooting", panel="panel", marks=marks, failed="failed",
-            own_scales=True, across=2, height=0.34, subtitle="a cross: no fit converges, so there is no coverage",
+            "identify", frame, [interval("value", label=" ")],
+            [text("problem", label="")], "dots", series="shooting", panel="series", marks=marks, failed="failed",
+            failed_name="no fit converges", own_scales=True, across=2, height=0.34,
         )
     ]  # fmt: skip

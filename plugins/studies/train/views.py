@@ -56,9 +56,10 @@ FAULTS = (
     Column("update", format="setting"),
     Column("value"),
 )
-COST = interval("cost", label="cost of an episode")
+COST = interval("cost", label="minus the return of an episode", ends="95% interval over seeds")
 STEP = Column("step", label="control steps", log=False)
 SEEDS = f"interquartile mean over seeds, with its 95% bootstrap interval from {MIN_SEEDS} seeds on"
+MIDDLES = "lower is better; interquartile mean over seeds"
 NOTE = (
     f"final return: the mean undiscounted return of the deterministic policy from the same starts, {SEEDS}. A run that is not "
     "finite counts as its untrained policy. used steps: control steps that updates use, median. at equal used steps: the return at "
@@ -305,11 +306,11 @@ def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
     cost = replace(COST, log=bool((frame["cost"] > 0).all()))
     curves = Chart(
         "train", frame.dropna(subset=["step"]), [STEP], [cost], series="method", panel="problem", band=True,
-        subtitle=f"cost: minus the return; {SEEDS}", text="A line per trainer with its chosen setting, at its evaluations.",
+        subtitle=MIDDLES,
     )  # fmt: skip
     final = windows.assign(cost=-windows["final"], cost_low=-windows["final_high"], cost_high=-windows["final_low"])
     lengths = Chart(
-        "windows", final, [replace(WINDOW, log=True)], [cost, WINDOW_BIAS, WINDOW_GRADIENT], series="family", panel="problem",
-        subtitle=f"after training; cost: minus the return; {SEEDS}", text="A point per length of window.",
+        "windows", final, [replace(WINDOW, log=True)], [cost], series="family", panel="problem",
+        title="What does the length of a window do?", subtitle=f"after training; {MIDDLES}",
     )  # fmt: skip
     return [replace(one, styles=method_styles(one.frame[one.series].unique())) for one in (curves, lengths)]
