@@ -50,8 +50,8 @@ USELESS = 1e2
 CUT = SIZE + 1
 """Height of the line of such a number, in points."""
 HOLLOW: dict[str, Any] = {"markerfacecolor": "white"}
-NEAR = 0.2
-"""Distance in inches from which an arrow joins two points."""
+NEAR = 20.0
+"""Distance from which an arrow joins two points, in hundredths of an inch."""
 LIMIT: dict[str, Any] = {"color": "#000000", "linewidth": 1.4}
 """Look of a limit across a grid."""
 MANY = 12
@@ -294,7 +294,7 @@ def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str
     x, y = chart.x[0], chart.y[0]
     for _, points in part.groupby(chart.arrow, sort=False):
         ends = np.array([points[x.name], points[y.name].clip(y.least, USELESS)], dtype=float).T
-        if np.ptp(panel.transData.transform(ends), axis=0).max() > NEAR * panel.get_figure().dpi:
+        if np.ptp(panel.transData.transform(ends), axis=0).max() > NEAR:
             look = {"arrowstyle": "-|>", "color": styles[str(points[chart.series].iloc[0])].colour, "linewidth": 1.6}
             panel.annotate("", ends[-1], ends[0], arrowprops=look, zorder=2)
             _name(panel, chart.arrow_name, marker="$\u2192$", markersize=10)

@@ -40,7 +40,7 @@ def short_names(names: Iterable[str]) -> dict[str, str]:
     words = [column for column in table if column[1] == ""]
     common = [column for name in IDENTITY for column in table if column[1] == name]
     kept = distinguishing_columns(table, table.index.to_series(), dict.fromkeys([*words, *common, *table]), words)
-    order = sorted(kept, key=lambda column: column[0] or "last")  # type: ignore[index]
+    order = sorted(kept, key=lambda column: column[0] or "last")
     short = [", ".join(filter(None, line)) for line in table[order].to_numpy()]
     return dict(zip(parsed, short if len(set(short)) == len(parsed) else parsed, strict=True))
 
