@@ -84,6 +84,18 @@ def difference(found, expected):
 
 def measure_backends():
     """Yield the time of every subject and of the C kernel at every batch size, and the peak memory without noise and result."""
+    for backend, contact, method in SUBJECTS:
+        compiled = problem(backend, contact)
+        for count in SIZES:
+            w = batch(compiled, count)
+            timing.reset_peak_memory()
+            each = seconds(partial(getattr(compiled, method), compiled.program.theta0, w)) / count
+            given = w.nbytes + 8 * count * (compiled.dim if method == "grad" else 1)
+            name = f"{backend} {method}, {contact}, {count:g} rollouts"
+            yield name, each * 1e6, "us"
+            yield f"{name}: peak memory", timing.peak_memory_mb() - given / 2**20, "MB"
+            if each * count * 10 > LONGEST:
+                break
     compiled = problem("jax")
     kernel = native.gradient(compiled.program.scene, compiled.program.contact.stiffness)
     w = batch(compiled, 64)
@@ -97,18 +109,6 @@ def measure_backends():
         given = compiled.program.theta0[:, None], batch(compiled, count), columns, 1, (compiled.dim,)
         each = seconds(partial(blocks.evaluate, kernel, *given)) / count
         yield f"native C kernel, {count:g} rollouts", each * 1e6, "us"
-    for backend, contact, method in SUBJECTS:
-        compiled = problem(backend, contact)
-        for count in SIZES:
-            w = batch(compiled, count)
-            timing.reset_peak_memory()
-            each = seconds(partial(getattr(compiled, method), compiled.program.theta0, w)) / count
-            given = w.nbytes + 8 * count * (compiled.dim if method == "grad" else 1)
-            name = f"{backend} {method}, {contact}, {count:g} rollouts"
-            yield name, each * 1e6, "us"
-            yield f"{name}: peak memory", timing.peak_memory_mb() - given / 2**20, "MB"
-            if each * count * 10 > LONGEST:
-                break
 
 
 def measure_overhead():
