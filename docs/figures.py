@@ -83,27 +83,31 @@ def speed(name: str) -> list[float]:
     return [speeds()[key] for batch in BATCHES if (key := name.replace("*", batch)) in speeds()]
 
 
+def over_c(name: str) -> list[float]:
+    """Return the times of a backend over those of the C loop."""
+    values = speed(f"{name}, * rollouts")
+    return list(np.divide(values, speed("native C kernel, * rollouts")[: len(values)]))
+
+
 def rollouts_table() -> str:
-    """Return microseconds per rollout by backend and batch as a Markdown table, with times over C where both take one thread."""
-    c, loop = speed("native C kernel, one thread, * rollouts"), speed("plain NumPy loop with its adjoint, * rollouts")
-    over_c = {name: speed(f"{name} on one thread over the C kernel, * rollouts") for name in ("fused", "jax")}
+    """Return microseconds of one thread per rollout by backend and batch as a Markdown table, with times over C for the same gradient."""
     lines = [
-        ("`fused` gradient", "0.6", speed("fused grad, penalty, * rollouts"), over_c["fused"]),
-        ("`jax` gradient", "1.2", speed("jax grad, penalty, * rollouts"), over_c["jax"]),
-        ("`implicit` gradient", "6", speed("implicit grad, complementarity, * rollouts"), []),
-        ("`torch` gradient", "25", speed("torch grad, penalty, * rollouts"), []),
-        ("`numpy` cost", "8", speed("numpy value, penalty, * rollouts"), []),
-        ("plain NumPy loop, gradient, one thread", "", loop, list(np.divide(loop, c[: len(loop)]))),
-        ("C loop, gradient, one thread", "", c, [1.0]),
+        ("C loop, gradient", "native C kernel", True),
+        ("`fused` gradient", "fused grad, penalty", True),
+        ("`jax` gradient", "jax grad, penalty", True),
+        ("`torch` gradient", "torch grad, penalty", True),
+        ("`numpy` cost", "numpy value, penalty", False),
+        ("`implicit` gradient, its own law", "implicit grad, complementarity", False),
     ]
     head = [
-        "| microseconds per rollout | target | 1,000 | 10,000 | 100,000 | 1,000,000 | on one thread, times the C loop |",
-        "|---" + "|--:" * 6 + "|",
+        "| microseconds of one thread per rollout | 1,000 | 10,000 | 100,000 | 1,000,000 | times the C loop |",
+        "|---" + "|--:" * 5 + "|",
     ]
     return block(head + [
-        f"| {name} | {target} | " + " | ".join([*map(number, values), *[""] * (4 - len(values))])
-        + f" | {span(ratios) if ratios else ''} |"
-        for name, target, values, ratios in lines
+        f"| {name} | " + " | ".join([*map(number, values), *[""] * (4 - len(values))])
+        + f" | {span(over_c(what)) if is_same else ''} |"
+        for name, what, is_same in lines
+        for values in [speed(f"{what}, * rollouts")]
     ])  # fmt: skip
 
 
@@ -119,20 +123,14 @@ def overhead_table() -> str:
         ("torch", "grad", "gradient"),
         ("numpy", "value", "cost"),
     ):
-        names = [f"{backend} {method} over by hand, {n} rollouts: processor time" for n in batches]
+        names = [f"{backend} {method} over by hand, {n} rollouts" for n in batches]
         lines.append(f"| `{backend}` {what} | " + " | ".join(number(speeds()[name]) for name in names) + " |")
     return block(lines)
 
 
-def overhead_agrees() -> str:
-    """Return the largest relative difference between the numbers of a backend and of the program written by hand."""
-    return number(
-        max(
-            value
-            for name, value in speeds().items()
-            if name.endswith("largest relative difference") and "by hand" in name
-        )
-    )
+def numbers_agree() -> str:
+    """Return the largest relative difference between numbers of this package and of programs written by hand."""
+    return number(max(value for name, value in speeds().items() if name.endswith("largest relative difference")))
 
 
 def dose(table: str, name: str = "dose_response") -> pd.DataFrame:
@@ -317,16 +315,17 @@ FIGURES: dict[str, str | Callable[[], str]] = {
     "speed-cell": lambda: number(speeds()["overhead of a cell"]),
     "speed-rollouts": rollouts_table,
     "speed-overhead": overhead_table,
-    "speed-overhead-agree": overhead_agrees,
     "speed-scenes": lambda: span(
         [value for scene in SCENES for value in speed(f"fused over jax, {scene}, * rollouts")]
     ),
     "speed-bounce": lambda: span(speed("fused over jax, bounce_once, * rollouts")),
-    "speed-one-thread": lambda: span(speed("fused on one thread over the C kernel, * rollouts")),
-    "speed-agree": lambda: number(speeds()["native C kernel: largest relative difference"]),
+    "speed-over-c": lambda: span(over_c("fused grad, penalty")),
+    "speed-sweep": lambda: number(speeds()["a sweep by the harness"]),
+    "speed-sweep-by-hand": lambda: number(speeds()["a sweep by hand"]),
+    "speed-sweep-ratio": lambda: number(speeds()["a sweep by the harness"] / speeds()["a sweep by hand"]),
+    "speed-agree": numbers_agree,
     "speed-memory-fused": lambda: span(speed("fused grad, penalty, * rollouts: peak memory"), 3),
     "speed-memory-jax": lambda: span(speed("jax grad, penalty, * rollouts: peak memory"), 3),
-    "speed-compilations": lambda: f"{speeds()['compilations over 27 values of stiffness x beta x sigma']:.0f}",
     "speed-plan": lambda: number(speeds()["planning 10000 cells"]),
     "speed-resume": lambda: number(speeds()["resuming 10000 stored cells"]),
     "speed-list": lambda: number(speeds()["python -m bench list"]),

@@ -1,27 +1,35 @@
 """`pushing` as a user would write it for one library, with the penalty spring and semi-implicit Euler.
 
-Each function returns a function of ``theta (T,)`` and ``w (T, B)`` in NumPy arrays.
+Costs and gradients are functions of ``theta (T,)`` and ``w (T, B)`` in NumPy arrays.
 """
+
+from functools import partial
 
 import numpy as np
 
 
-def jax_gradient(scene, stiffness):
-    """Return the gradient ``(T, B)`` by ``jit(vmap(grad(scan)))``."""
+def jax_cost(scene):
+    """Return the cost of one rollout as a function of the stiffness, ``theta (T,)`` and ``w (T,)``."""
     import jax
     import jax.numpy as jnp
 
-    def cost(theta, w):
+    def cost(stiffness, theta, w):
         def step(carry, u):
             total, state = carry
-            stage, state = _step(scene, stiffness, jnp.maximum, state, u)
-            return (total + stage, state), None
+            return (total + _distance(scene, *state) + u * u, _move(scene, stiffness, jnp.maximum, state, u)), None
 
         first = (0.0, (0.0, 1.0, scene.speed, 0.0))
         (total, last), _ = jax.lax.scan(step, first, theta + scene.sigma * w)
         return total + _distance(scene, *last)
 
-    gradient = jax.jit(jax.vmap(jax.grad(cost), in_axes=(None, 1), out_axes=1))
+    return cost
+
+
+def jax_gradient(scene, stiffness):
+    """Return the gradient ``(T, B)`` by ``jit(vmap(grad(scan)))``."""
+    import jax
+
+    gradient = jax.jit(jax.vmap(jax.grad(partial(jax_cost(scene), stiffness)), in_axes=(None, 1), out_axes=1))
     return lambda theta, w: np.asarray(gradient(theta, w))
 
 
@@ -51,18 +59,18 @@ def numpy_cost(scene, stiffness):
 def _cost(scene, stiffness, maximum, controls, zero):
     total, state = zero, (zero, zero + 1.0, zero + scene.speed, zero)
     for u in controls:
-        stage, state = _step(scene, stiffness, maximum, state, u)
-        total = total + stage
+        total = total + _distance(scene, *state) + u * u
+        state = _move(scene, stiffness, maximum, state, u)
     return total + _distance(scene, *state)
 
 
-def _step(scene, stiffness, maximum, state, u):
-    """Return the cost of a step and the state after it."""
+def _move(scene, stiffness, maximum, state, u):
+    """Return the state after a step from (x1, x2, v1, v2) under the force u."""
     x1, x2, v1, v2 = state
     h, h_over_m, c = scene.dt, scene.dt / scene.mass, scene.velocity_factor
     force = stiffness * maximum(x1 + 1.0 - x2, 0.0)
     after = c * v1 + h_over_m * (u - force), c * v2 + h_over_m * force
-    return _distance(scene, *state) + u * u, (x1 + h * after[0], x2 + h * after[1], *after)
+    return x1 + h * after[0], x2 + h * after[1], *after
 
 
 def _distance(scene, x1, x2, v1, v2):
