@@ -20,7 +20,7 @@ from bench.examine.lines import scan
 from bench.examine.subspace import Group, Subspace
 from bench.gradient import FAULTS, RULES
 from bench.simulator.simulator import Simulator
-from bench.simulator.tree import ParameterTree
+from bench.simulator.tree import ParameterTree, numbers
 
 Costs = Callable[[np.ndarray], np.ndarray]
 """Costs of columns: ``(d, B)`` to ``(B,)``."""
@@ -42,6 +42,7 @@ LARGER, EARLIER = 200.0, 3
 """Factor on the largest norm of at least this number of earlier checks above which a gradient explodes."""
 MEANINGS = {
     "opposed": f"the cosine of the gradient with a zeroth-order estimate is certainly below 0 in {EARLIER} checks in a row",
+    "not_finite": "theta, or the cost and its gradient, are not finite",
     "explodes": f"the norm is more than {LARGER:g} times the largest before",
 }
 """Why a gradient is of no use, beside the faults of a check."""
@@ -50,10 +51,10 @@ MEANINGS = {
 class Watch:
     """A log of an optimization loop, ``bench.watch``: called as ``log(theta, gradient)`` in every iteration, it checks some.
 
-    ``cost(theta)`` returns one number, or ``cost(theta, w)`` where the calls pass the noise ``w``. Every ``every``
-    iterations the gradient is checked, but not more often than takes ``share`` of the loop's time, without the first
-    check, which may compile. ``out`` is a CSV file to which each check adds a line. ``str()`` names the first iteration
-    at which the gradient was of no use.
+    ``cost(theta)`` returns one number, or ``cost(theta, w)`` where the calls pass what else belongs to the gradient, ``w``.
+    Every ``every`` iterations the gradient is checked, but not more often than takes ``share`` of the loop's time, without
+    the first check, which may compile. JAX compiles only a cost that is compiled itself, ``jax.jit(cost)``. ``out`` is a CSV
+    file to which each check adds a line. ``str()`` names the first iteration at which the gradient was of no use.
 
     ``rows`` has a line per checked iteration: the norm of the gradient, the verdict of a check along random directions
     with the largest relative error, the difference of two equal calls of the cost, ratio and cosine of a zeroth-order estimate
@@ -86,6 +87,7 @@ class Watch:
         self.iteration = -1
         """The last iteration, counted from 0."""
         self._simulator: Simulator | None = None
+        self._given: tuple[Any, ...] = ()
         self._before = np.empty(0)
         self._began = time.perf_counter()
         self._spent = self._longest = 0.0
@@ -93,9 +95,9 @@ class Watch:
     def __call__(self, theta: Any, gradient: Any, w: Any = None) -> None:
         """Count an iteration, and check the gradient at ``theta`` if it is due and the share of time allows.
 
-        ``theta`` and ``gradient`` have the same structure: an array, or nested dicts and lists of arrays. ``w (n,)`` is
-        the noise with which the gradient was computed; the cost is then called as ``cost(theta, w)``. Never raises, and
-        changes neither theta nor the state of random generators.
+        ``theta`` and ``gradient`` have the same structure: an array, or nested dicts and lists of arrays. ``w`` is what the
+        gradient was computed with, such as noise, a batch or a state; the cost is then called as ``cost(theta, w)``. Never
+        raises, and changes neither theta nor the state of random generators.
         """
         self.iteration += 1
         if self.iteration % self.every == 0 and self._is_affordable():
@@ -130,20 +132,17 @@ class Watch:
 
     def _is_affordable(self) -> bool:
         elapsed = time.perf_counter() - self._began
-        return self._spent + self._longest <= self.share * elapsed or not self.rows
+        return self._spent + self._longest <= self.share * elapsed
 
     def _measure(self, theta: Any, gradient: Any, w: Any) -> dict[str, Any]:
+        if not np.isfinite(numbers(theta)).all():
+            return {"verdict": "not_finite"}
         layout = ParameterTree(theta)
-        slopes, drawn = layout.flatten(gradient), np.empty(0) if w is None else np.asarray(w, dtype=float).ravel()
+        slopes, self._given = layout.flatten(gradient), () if w is None else (w,)
         if self._simulator is None:
-            self._simulator = Simulator(self.cost, layout, noise=drawn.size)
+            self._simulator = Simulator(lambda x: self.cost(x, *self._given), layout, compiles=False)
         simulator, at, scale = self._simulator, layout.vector, layout.scales()
-        before = simulator.clock.costs
-
-        def costs(thetas: np.ndarray) -> np.ndarray:
-            own = np.repeat(drawn[:, None], thetas.shape[1], axis=1) if drawn.size else None
-            return simulator.costs(thetas, own)
-
+        before, costs = simulator.clock.costs, simulator.costs
         draw = np.random.default_rng([self.seed, self.iteration])
         vectors = [scale * (one / np.linalg.norm(one)) for one in draw.standard_normal((DIRECTIONS, at.size))]
         space = Subspace(layout, scale, [], [Group(f"direction {i}", 0, at.size, v) for i, v in enumerate(vectors)])
@@ -152,12 +151,13 @@ class Watch:
         few = FewSteps(space, costs, slopes, value, simulator.unit, noise)
         for _ in ROUNDS:
             few.run_round(simulator.width)
-        checked = few.check()
+        checked, is_finite = few.check(), np.isfinite(slopes).all()
         row = {
-            "cost": value, "gradient_norm": float(np.linalg.norm(slopes)), "verdict": checked.cause,
+            "cost": value, "gradient_norm": float(np.linalg.norm(slopes)),
+            "verdict": checked.cause if is_finite or checked.cause != "nonfinite" else "not_finite",
             "error": max(part.error for part in checked.parts), "noise": noise,
         }  # fmt: skip
-        if np.isfinite(slopes).all():
+        if is_finite:
             has_moved = self._before.size == at.size and (self._before != at).any()
             step = at - self._before if has_moved else FIRST_STEP * scale
             row |= _pairs(costs, at, slopes, step, draw) | _along(costs, at, slopes, step, value, noise, simulator.unit)
@@ -169,13 +169,14 @@ class Watch:
         norms = [row["gradient_norm"] for row in self.rows]
         for k, row in enumerate(self.rows):
             reasons = {
-                row["verdict"]: row["verdict"] in FAULTS,
+                row["verdict"]: row["verdict"] in (*FAULTS, "not_finite"),
                 "opposed": k >= EARLIER - 1
                 and all(one["cosine_high"] < 0.0 for one in self.rows[k - EARLIER + 1 : k + 1]),
                 "explodes": k >= EARLIER and row["gradient_norm"] > LARGER * np.nanmax(norms[:k]),
             }
-            for reason in (reason for reason, is_true in reasons.items() if is_true):
-                return row["iteration"], reason
+            for reason, is_true in reasons.items():
+                if is_true:
+                    return row["iteration"], reason
         return None
 
     def __str__(self) -> str:
@@ -191,12 +192,10 @@ class Watch:
     def _write(self) -> None:
         if self.out is None:
             return
-        is_new = len(self.rows) == 1
-        with self.out.open("w" if is_new else "a", newline="") as file:
+        with self.out.open("w", newline="") as file:
             writer = csv.DictWriter(file, COLUMNS)
-            if is_new:
-                writer.writeheader()
-            writer.writerow(self.rows[-1])
+            writer.writeheader()
+            writer.writerows(self.rows)
 
     def draw(self, path: str | Path) -> Path:
         """Write a chart of the log and return its path; needs Matplotlib."""
@@ -242,7 +241,7 @@ def _along(
     """Return the jumps along the last step, and the share of its length at which a step against the gradient lowers the cost."""
     line = scan(lambda t: costs(at[:, None] + step[:, None] * (t - 1.0) / 2.0), step, noise, 1.0, LINE, unit)
     length, norm = float(np.linalg.norm(step)), float(np.linalg.norm(slopes))
-    down = -slopes * length / norm if norm else np.zeros_like(slopes)
+    down = -slopes * (length / norm if norm else 0.0)
     changes = costs(at[:, None] + down[:, None] * np.array(SHARES)) - value
     rounding = 16.0 * (unit * abs(value) + noise)
     lowered = [share for share, change in zip(SHARES, changes, strict=True) if change < 0.0]
