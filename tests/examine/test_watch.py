@@ -54,7 +54,6 @@ def test_a_sound_loop_is_silent(seed):
     log, _ = adam(True, seed, updates=200)
     assert log.first is None
     assert "no fault" in str(log)
-    assert [row["iteration"] for row in log.rows] == list(range(0, 200, 20))
 
 
 @pytest.mark.parametrize(("sign", "lowers"), [(1.0, 1.0), (-1.0, 0.0)])
@@ -105,6 +104,8 @@ def test_the_share_of_time_limits_the_checks(monkeypatch):
     for _ in range(1000):
         log(np.ones(2), 2 * np.ones(2))
         now[0] += 10.0
+    log(np.ones(2), 1e3 * np.ones(2))
+    assert log.first == (1000, "explodes"), "the norm needs no check"
     spent = sum(row["seconds"] for row in log.rows[1:])
     assert 0.05 * (now[0] - log.rows[0]["seconds"]) < spent <= 0.1 * (now[0] - log.rows[0]["seconds"])
 
@@ -136,7 +137,6 @@ def test_wrong_numbers_are_named(theta, gradient, reason):
     log = bench.watch(lambda x: float(x @ x), every=1, share=math.inf)
     log(np.array([theta, 1.0]), np.array(gradient))
     assert log.first == (0, reason)
-    assert log.rows[0]["reason"] == ""
 
 
 def test_a_failing_cost_does_not_end_the_loop(tmp_path):
