@@ -158,16 +158,18 @@ def right_cases():
 # ------------------------------------------------------------------------------------------------ torch
 
 
+def fall(x, cut=lambda f: f, state=lambda q: q, steps=35, stiffness=200.0):
+    """Return the cost of a ball on a damped spring floor; theta is height and upward speed, and ``cut`` is of the floor's force."""
+    q, v = x[0], x[1]
+    for _ in range(steps):
+        depth = (-q).relu()
+        v = v + 0.01 * (cut(stiffness * depth - 3.0 * depth * v) - 9.81)
+        q = state(q + 0.01 * v)
+    return (q - 0.2) ** 2 + 0.1 * v * v
+
+
 def torch_cases():
     import torch
-
-    def fall(x, cut=lambda f: f, state=lambda q: q, steps=35):
-        q, v = x[0], x[1]
-        for _ in range(steps):
-            force = -9.81 + cut(200.0 * torch.relu(-q) - 3.0 * torch.relu(-q) * v)
-            v = v + 0.01 * force
-            q = state(q + 0.01 * v)
-        return (q - 0.2) ** 2 + 0.1 * v * v
 
     def clamped(q):
         q = q.clone()

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+import yaml
 from bench.plugins.backends.jax import Jax
 from bench.plugins.estimators.fobg import Fobg
 from bench.plugins.studies import SPREAD
@@ -380,83 +381,18 @@ def thermostat(low, high, heat):
     return cost
 
 
-FAMILIES = {
-    "first": (
-        (edge, (2.0,), 0.2, (1.2, 1.0, 1.0), (1.7, 1.0, 1.0), (1.3, 5.0, 0.7)),
-        (ledge, (3.0,), 0.2, (1.2, 0.5)),
-        (ledge, (3.0,), 0.1, (1.5, 0.1)),
-        (ledge, (3.0,), 0.3, (1.7, 0.02)),
-        (gate, (0.4,), 0.3, (1.4, 1.6, 0.5), (1.9, 2.5, 5.0), (0.95, 1.0, 0.2)),
-        (latch, (0.8,), 0.2, (0.2, 20.0)),
-        (latch, (1.4,), 0.2, (0.0, 5.0)),
-        (latch, (0.7,), 0.2, (0.0, 1.0)),
-        (friction, (1.0,), 0.2, (0.3, 0.01), (0.1, 0.001)),
-        (friction, (2.0,), 0.2, (0.2, 0.1)),
-        (flight, (3.0, 2.0), 0.3, (2.0, 0.1)),
-        (flight, (2.0, 5.0), 0.3, (5.0, 0.05)),
-        (flight, (6.0, 6.0), 0.3, (0.0, 1.0)),
-        (contact, (1.0,), 0.1, (1e3, 0.3), (1e5, 0.75)),
-        (contact, (0.8,), 0.1, (1e4, 0.6)),
-        (chaos, (0.3,), 0.1, (3.9, 6), (3.9, 30), (3.57, 40)),
-        (saturation, (1.0,), 0.3, (0.5, 2.0), (5.0, 1.0), (0.1, 4.0)),
-        (plane, (0.5,) * 3, 1.0, (3, 2.0, 3.0)),
-        (plane, (0.5,) * 5, 1.0, (5, 2.5, 10.0)),
-        (plane, (0.5,) * 10, 1.0, (10, 3.0, 22.6)),
-    ),
-    "new": (
-        (switch, (0.0,), 1.0, (5.0, 0.7, 1e-5), (2.0, 1.5, 1e-6), (0.5, 0.2, 1e-4), (20.0, 2.2, 1e-5)),
-        (stop, (0.0,), 1.0, (2e4, 3.6), (3.12e4, 3.9), (1e3, 3.3), (50.0, 2.5)),
-        (corner, (0.0, 0.0), 1.0, (2.0, 2.0, 651.4), (1.0, 1.0, 5.0), (1.5, 0.5, 3.0), (2.5, 2.5, 2000.0)),
-        (relay, (0.6,), 0.1, (1.0, 0.1)),
-        (relay, (0.5,), 0.1, (3.0, 0.05), (1.0, 0.3)),
-        (relay, (1.5,), 0.1, (2.0, 0.2)),
-        (backlash, (1.0,), 0.2, (0.1, 0.1), (0.3, 0.1)),
-        (backlash, (0.6,), 0.2, (0.5, 0.3)),
-        (backlash, (2.0,), 0.2, (0.05, 0.2)),
-        (quantiser, (0.6,), 0.3, (0.25, 0.1)),
-        (quantiser, (0.4,), 0.3, (0.01, 0.5)),
-        (quantiser, (0.3,), 0.3, (1.0, 1.0)),
-        (quantiser, (0.2,), 0.3, (0.1, 5.0)),
-        (delay, (1.0,), 0.2, (1, 1.0), (5, 1.0), (20, 1.5)),
-        (delay, (0.8,), 0.2, (10, 2.0)),
-        (table, (0.0,), 1.0, ((0.5, 1.0), (0.0, 0.3, 0.1), 0.0), ((0.5, 1.0), (0.0, 0.3, 0.1), 0.2)),
-        (table, (0.0,), 1.0, ((1.2,), (0.0, 4.0), 1e-4), ((-0.4, 2.0), (0.0, 0.02, 3.0), 0.01)),
-    ),
-    "newest": (
-        (aliasing, (0.9,), 0.3, (8, 1.0), (40, 1.0)),
-        (aliasing, (0.4,), 0.1, (20, 0.5)),
-        (order, (0.5, 0.6), 0.2, (1.0, 1.0, 2.0), (1.0, 1.05, 1.0), (2.0, 1.0, 3.0)),
-        (chatter, (0.7,), 0.2, (0.05, 60, 0.5), (0.01, 200, 1.0)),
-        (chatter, (2.5,), 0.1, (0.05, 30, 0.0)),
-        (far, (0.0,), 1.0, (3.5, 3000.0), (4.2, 1e5), (5.5, 1e6)),
-        (pulse, (0.0,), 1.0, (2.0, 1.0, 0.3), (200.0, 0.5, 5e-3), (4e4, 0.5, 5e-5)),
-        (clipped, (1.0, 1.0), 0.2, (0.5, 0.1), (10.0, 0.0), (0.1, 0.0)),
-        (rotation, (0.9, 0.1, 0.1, 0.4), 0.1, (1.0, False), (3.0, True)),
-        (rotation, (0.5, 0.2, 0.0, 0.8), 0.2, (-1.2, True)),
-        (single, (0.3,), 0.1, (10.0, 1.0), (1e4, 1.0), (1e6, 1.0)),
-        (heavy, (0.0,), 1.0, (0.5, 1.0), (2.0, 0.01), (1.0, 1e-4)),
-        (mixed, (0.0, 0.5, 1.0), 0.1, (1.0, 1.0, 0.0), (100.0, 100.0, 0.1), (5.0, 1e4, 3.0)),
-        (wide, (0.3,) * 30, 0.2, (30, 0.3, 10.0)),
-        (wide, (0.3,) * 100, 0.2, (100, 0.14, 1.0)),
-        (wide, (0.3,) * 300, 0.2, (300, 0.5, 1.0)),
-        (median, (0.4,), 0.2, (1.0, 0.1), (0.1, 1.0), (0.4, 0.0)),
-        (newton, (0.5,), 0.1, (2, 1.0), (30, 1.3)),
-        (newton, (0.3,), 0.2, (12, -1.2)),
-        (thermostat, (0.0,), 0.2, (0.3, 0.6, 1.0), (-5.0, 5.0, 1.0)),
-        (thermostat, (1.5,), 0.3, (0.3, 0.6, 1.0)),
-    ),
-}
-"""By part: cost, theta, noise, and arguments of each scene. Families of `new` and `newest` were added when the rule was complete."""
+FAMILIES = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text())
+"""By part: the scenes of each family."""
 
 
 def scenes():
     """Return every scene."""
     return [
-        Scene(part, make.__name__, str(given), make(*given), theta, sigma)
-        for part, families in FAMILIES.items()
-        for make, theta, sigma, *every in families
-        for given in every
-    ]
+        Scene(part, one["cost"], str(given), globals()[one["cost"]](*given), tuple(one["theta"]) * one.get("times", 1), one["sigma"])
+        for part, every in FAMILIES.items()
+        for one in every
+        for given in one["given"]
+    ]  # fmt: skip
 
 
 PLUGIN = '''"""The scenes of trusted.py as a plugin, so that `gradcheck` runs on them as a user runs it."""

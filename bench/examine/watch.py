@@ -8,7 +8,7 @@ import random
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from bench.examine.lines import scan
 from bench.examine.subspace import Group, Subspace
 from bench.gradient import FAULTS, RULES
 from bench.simulator.simulator import Simulator
-from bench.simulator.tree import ParameterTree
+from bench.simulator.tree import ParameterTree, numbers
 
 Costs = Callable[[np.ndarray], np.ndarray]
 """Costs of columns: ``(d, B)`` to ``(B,)``."""
@@ -42,6 +42,7 @@ LARGER, EARLIER = 200.0, 3
 """Factor on the largest norm of at least this number of earlier checks above which a gradient explodes."""
 MEANINGS = {
     "opposed": f"the cosine of the gradient with a zeroth-order estimate is certainly below 0 in {EARLIER} checks in a row",
+    "not_finite": "theta or its gradient is not finite",
     "explodes": f"the norm is more than {LARGER:g} times the largest before",
 }
 """Why a gradient is of no use, beside the faults of a check."""
@@ -50,15 +51,16 @@ MEANINGS = {
 class Watch:
     """A log of an optimization loop, ``bench.watch``: called as ``log(theta, gradient)`` in every iteration, it checks some.
 
-    ``cost(theta)`` returns one number, or ``cost(theta, w)`` where the calls pass the noise ``w``. Every ``every``
-    iterations the gradient is checked, but not more often than takes ``share`` of the loop's time, without the first
-    check, which may compile. ``out`` is a CSV file to which each check adds a line. ``str()`` names the first iteration
-    at which the gradient was of no use.
+    ``cost(theta)`` returns one number, or ``cost(theta, w)`` where the calls pass what else belongs to the gradient, ``w``.
+    Every ``every`` iterations the norm of the gradient is noted, and the gradient is checked unless that would take more than
+    ``share`` of the loop's time, without the first check, which may compile. JAX compiles only a cost that is compiled itself,
+    ``jax.jit(cost)``. ``out`` is a CSV file of the rows. ``str()`` names the first noted iteration at which the gradient was
+    of no use.
 
-    ``rows`` has a line per checked iteration: the norm of the gradient, the verdict of a check along random directions
-    with the largest relative error, the difference of two equal calls of the cost, ratio and cosine of a zeroth-order estimate
-    from mirrored pairs to the gradient, with 95% intervals, the jumps along the last step, and the share of its length
-    at which a step against the gradient lowers the cost (0: at none).
+    ``rows`` has a line per noted iteration: the norm of the gradient and, where it was checked, the verdict along random
+    directions with the largest relative error, the difference of two equal calls of the cost, ratio and cosine of a
+    zeroth-order estimate from mirrored pairs to the gradient, with 95% intervals, the jumps along the last step, and the share
+    of its length at which a step against the gradient lowers the cost (0: at none).
 
     >>> log = Watch(lambda x: float(x @ x), every=1, share=math.inf)
     >>> log(np.array([1.0, 2.0]), np.array([2.0, 4.0]))
@@ -86,23 +88,23 @@ class Watch:
         self.iteration = -1
         """The last iteration, counted from 0."""
         self._simulator: Simulator | None = None
+        self._given: tuple[Any, ...] = ()
         self._before = np.empty(0)
         self._began = time.perf_counter()
         self._spent = self._longest = 0.0
 
     def __call__(self, theta: Any, gradient: Any, w: Any = None) -> None:
-        """Count an iteration, and check the gradient at ``theta`` if it is due and the share of time allows.
+        """Count an iteration; if it is due, note the gradient's norm, and check the gradient if the share of time allows.
 
-        ``theta`` and ``gradient`` have the same structure: an array, or nested dicts and lists of arrays. ``w (n,)`` is
-        the noise with which the gradient was computed; the cost is then called as ``cost(theta, w)``. Never raises, and
-        changes neither theta nor the state of random generators.
+        ``theta`` and ``gradient`` have the same structure: an array, or nested dicts and lists of arrays. ``w`` is what the
+        gradient was computed with, such as noise, a batch or a state; the cost is then called as ``cost(theta, w)``. Never
+        raises, and changes neither theta nor the state of random generators.
         """
         self.iteration += 1
-        if self.iteration % self.every == 0 and self._is_affordable():
+        if self.iteration % self.every == 0:
             self._check(theta, gradient, w)
         if (self.iteration + 1) % self.every == 0:
-            with suppress(Exception):  # the next check then has no last step
-                self._before = ParameterTree(theta).vector.copy()
+            self._before = numbers(theta).copy()
 
     def _check(self, theta: Any, gradient: Any, w: Any) -> None:
         """Add a row on the gradient at theta, and write it."""
@@ -114,7 +116,7 @@ class Watch:
         }
         with _same_random_numbers(), np.errstate(all="ignore"):
             try:
-                row |= self._measure(theta, gradient, w)
+                self._measure(row, theta, gradient, w)
             except Exception as error:
                 row["reason"] = failure(error)["reason"]
         taken = row["seconds"] = time.perf_counter() - began
@@ -123,27 +125,28 @@ class Watch:
         else:
             self._began += taken
         self.rows.append(row)
+        if not self.out:
+            return
         try:
-            self._write()
+            is_started = len(self.rows) > 1
+            with self.out.open("a" if is_started else "w", newline="") as file:
+                csv.writer(file).writerows([COLUMNS, row.values()][is_started:])
         except OSError as error:
             row["reason"] = f"{self.out} cannot be written: {error}"
 
-    def _is_affordable(self) -> bool:
-        elapsed = time.perf_counter() - self._began
-        return self._spent + self._longest <= self.share * elapsed or not self.rows
-
-    def _measure(self, theta: Any, gradient: Any, w: Any) -> dict[str, Any]:
+    def _measure(self, row: dict[str, Any], theta: Any, gradient: Any, w: Any) -> None:
+        """Add what is known of theta and its gradient to a row."""
+        if not np.isfinite(numbers(theta)).all():
+            return
         layout = ParameterTree(theta)
-        slopes, drawn = layout.flatten(gradient), np.empty(0) if w is None else np.asarray(w, dtype=float).ravel()
+        slopes, self._given = layout.flatten(gradient), () if w is None else (w,)
+        row["gradient_norm"] = float(np.linalg.norm(slopes))
+        if self._spent + self._longest > self.share * (time.perf_counter() - self._began):
+            return
         if self._simulator is None:
-            self._simulator = Simulator(self.cost, layout, noise=drawn.size)
+            self._simulator = Simulator(lambda x: self.cost(x, *self._given), layout, compiles=False)
         simulator, at, scale = self._simulator, layout.vector, layout.scales()
-        before = simulator.clock.costs
-
-        def costs(thetas: np.ndarray) -> np.ndarray:
-            own = np.repeat(drawn[:, None], thetas.shape[1], axis=1) if drawn.size else None
-            return simulator.costs(thetas, own)
-
+        before, costs = simulator.clock.costs, simulator.costs
         draw = np.random.default_rng([self.seed, self.iteration])
         vectors = [scale * (one / np.linalg.norm(one)) for one in draw.standard_normal((DIRECTIONS, at.size))]
         space = Subspace(layout, scale, [], [Group(f"direction {i}", 0, at.size, v) for i, v in enumerate(vectors)])
@@ -153,33 +156,36 @@ class Watch:
         for _ in ROUNDS:
             few.run_round(simulator.width)
         checked = few.check()
-        row = {
-            "cost": value, "gradient_norm": float(np.linalg.norm(slopes)), "verdict": checked.cause,
-            "error": max(part.error for part in checked.parts), "noise": noise,
+        row |= {
+            "cost": value, "verdict": checked.cause, "error": max(part.error for part in checked.parts), "noise": noise,
         }  # fmt: skip
         if np.isfinite(slopes).all():
             has_moved = self._before.size == at.size and (self._before != at).any()
             step = at - self._before if has_moved else FIRST_STEP * scale
             row |= _pairs(costs, at, slopes, step, draw) | _along(costs, at, slopes, step, value, noise, simulator.unit)
-        return row | {"costs": simulator.clock.costs - before}
+        row["costs"] = simulator.clock.costs - before
 
     @property
     def first(self) -> tuple[int, str] | None:
-        """The first checked iteration at which the gradient was of no use, and the reason; None if there is none."""
-        norms = [row["gradient_norm"] for row in self.rows]
+        """The first noted iteration at which the gradient was of no use, and the reason; None if there is none."""
+        cosines: list[float] = []
+        largest = 0.0
         for k, row in enumerate(self.rows):
+            if row["costs"] > 0:
+                cosines.append(row["cosine_high"])
             reasons = {
                 row["verdict"]: row["verdict"] in FAULTS,
-                "opposed": k >= EARLIER - 1
-                and all(one["cosine_high"] < 0.0 for one in self.rows[k - EARLIER + 1 : k + 1]),
-                "explodes": k >= EARLIER and row["gradient_norm"] > LARGER * np.nanmax(norms[:k]),
+                "not_finite": not (row["reason"] or math.isfinite(row["gradient_norm"])),
+                "opposed": sum(cosine < 0.0 for cosine in cosines[-EARLIER:]) == EARLIER,
+                "explodes": k >= EARLIER and row["gradient_norm"] > LARGER * largest,
             }
-            for reason in (reason for reason, is_true in reasons.items() if is_true):
+            for reason in filter(reasons.get, reasons):
                 return row["iteration"], reason
+            largest = np.fmax(largest, row["gradient_norm"])
         return None
 
     def __str__(self) -> str:
-        checks = f"{len(self.rows)} of {self.iteration + 1} iterations checked"
+        checks = f"{sum(row['costs'] > 0 for row in self.rows)} of {self.iteration + 1} iterations checked"
         failed = [row for row in self.rows if row["reason"]]
         text = f"{checks}, {len(failed)} not: {failed[0]['reason']}" if failed else checks
         if self.first is None:
@@ -188,31 +194,24 @@ class Watch:
         meaning = RULES[code].meaning if code in RULES else MEANINGS[code]
         return f"{text}: of no use from iteration {iteration} on ({code}: {meaning})"
 
-    def _write(self) -> None:
-        if self.out is None:
-            return
-        is_new = len(self.rows) == 1
-        with self.out.open("w" if is_new else "a", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS)
-            if is_new:
-                writer.writeheader()
-            writer.writerow(self.rows[-1])
-
     def draw(self, path: str | Path) -> Path:
         """Write a chart of the log and return its path; needs Matplotlib."""
         with needing_sweeps("a chart"):
             from matplotlib.figure import Figure
 
-        columns = {name: [row[name] for row in self.rows] for name in COLUMNS}
         figure = Figure(figsize=(7.0, 6.0), layout="constrained")
         scales = {"gradient_norm": "log", "error": "log", "cosine": "linear"}
         for panel, (name, scale) in zip(figure.subplots(3, sharex=True), scales.items(), strict=True):
-            panel.plot(columns["iteration"], columns[name], "o-")
-            panel.set(ylabel=name.replace("_", " "), yscale=scale, xlabel="iteration" * (name == "cosine"))
+            rows = [row for row in self.rows if math.isfinite(row[name])]
+            at = [row["iteration"] for row in rows]
+            panel.plot(at, [row[name] for row in rows], "o-")
+            panel.set(ylabel=name.replace("_", " "), yscale=scale)
             if self.first is not None:
                 panel.axvline(self.first[0], color="tab:red", label=self.first[1])
                 panel.legend()
-        panel.fill_between(columns["iteration"], columns["cosine_low"], columns["cosine_high"], alpha=0.2)
+        low, high = ([row[f"cosine_{end}"] for row in rows] for end in ("low", "high"))
+        panel.fill_between(at, low, high, alpha=0.2)
+        panel.set_xlabel("iteration")
         figure.savefig(path, dpi=150)
         return Path(path)
 
@@ -242,14 +241,14 @@ def _along(
     """Return the jumps along the last step, and the share of its length at which a step against the gradient lowers the cost."""
     line = scan(lambda t: costs(at[:, None] + step[:, None] * (t - 1.0) / 2.0), step, noise, 1.0, LINE, unit)
     length, norm = float(np.linalg.norm(step)), float(np.linalg.norm(slopes))
-    down = -slopes * length / norm if norm else np.zeros_like(slopes)
+    down = -slopes * (length / norm if norm else 0.0)
     changes = costs(at[:, None] + down[:, None] * np.array(SHARES)) - value
     rounding = 16.0 * (unit * abs(value) + noise)
     lowered = [share for share, change in zip(SHARES, changes, strict=True) if change < 0.0]
     is_known = bool((changes > rounding).all())
     return {
         "jumps": len(line.jumps), "largest_jump": max((jump.size for jump in line.jumps), default=0.0),
-        "lowers": max(lowered) if lowered else 0.0 if is_known else math.nan,
+        "lowers": max(lowered, default=0.0 if is_known else math.nan),
     }  # fmt: skip
 
 

@@ -42,7 +42,8 @@ class Simulator:
 
     ``noise`` is the length of w, 0 for a cost without its own noise. ``library`` is the library of the arrays that the
     functions receive; by default that of ``grad`` or of theta. An exception in a call yields NaN, except in the
-    first call, where it becomes a :class:`UserError`.
+    first call, where it becomes a :class:`UserError`. Without ``compiles`` JAX does not compile the functions, which
+    may then depend on what changes between calls; those that are compiled themselves stay so.
     """
 
     def __init__(
@@ -54,6 +55,7 @@ class Simulator:
         batch: str | int | None = None,
         clock: Clock | None = None,
         library: str = "",
+        compiles: bool = True,
     ) -> None:
         if not callable(cost):
             raise UserError(f"the cost is a function of theta, not {type(cost).__name__}")
@@ -67,6 +69,7 @@ class Simulator:
                 f"batch={batch} needs a theta that is one vector; this one is {', '.join(leaf.name for leaf in layout.leaves[:4])}"
             )
         self.layout, self.noise, self.clock = layout, noise, clock or Clock(float("inf"))
+        self._compiles = compiles
         self.notes: list[str] = []
         """Notes for the user on how the cost is called."""
         self.raised: dict[str, int] = {}
@@ -444,7 +447,8 @@ class Simulator:
 
         if batch not in self._compiled:
             eager = self._jax_functions(batch)
-            self._compiled[batch] = eager, {name: jax.jit(function) for name, function in eager.items()}
+            jitted = {name: jax.jit(function) for name, function in eager.items()} if self._compiles else eager
+            self._compiled[batch] = eager, jitted
         eager, compiled = self._compiled[batch]
         arguments = [self._array(part) for part in parts]
         if batch != "loop":

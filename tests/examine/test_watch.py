@@ -54,7 +54,6 @@ def test_a_sound_loop_is_silent(seed):
     log, _ = adam(True, seed, updates=200)
     assert log.first is None
     assert "no fault" in str(log)
-    assert [row["iteration"] for row in log.rows] == list(range(0, 200, 20))
 
 
 @pytest.mark.parametrize(("sign", "lowers"), [(1.0, 1.0), (-1.0, 0.0)])
@@ -80,23 +79,17 @@ def test_a_term_that_is_detached_is_named_from_its_iteration_on():
 def test_a_step_that_becomes_unstable_is_named():
     log, _ = adam(True, updates=240, fault="unstable", at=200)
     assert log.first == (200, "explodes")
-    assert log.rows[10]["gradient_norm"] > 200 * max(row["gradient_norm"] for row in log.rows[:10])
 
 
 def test_theta_and_random_numbers_are_those_without_the_log():
-    random.seed(1)
-    np.random.seed(1)  # noqa: NPY002
-    first = adam(False, updates=60)[1], random.random(), np.random.random()  # noqa: NPY002
-    random.seed(1)
-    np.random.seed(1)  # noqa: NPY002
-
     def cost(theta):
         return float(theta @ theta) + 0.0 * np.random.random() + 0.0 * random.random()  # noqa: NPY002
 
+    before = random.getstate(), np.random.get_state()  # noqa: NPY002
     log = bench.watch(cost, every=1, share=math.inf)
     log(np.ones(3), 2 * np.ones(3))
-    second = adam(True, updates=60)[1], random.random(), np.random.random()  # noqa: NPY002
-    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+    np.testing.assert_equal((random.getstate(), np.random.get_state()), before)  # noqa: NPY002
+    assert np.array_equal(*(adam(is_watched, updates=60)[1] for is_watched in (False, True)))
 
 
 def test_the_share_of_time_limits_the_checks(monkeypatch):
@@ -111,31 +104,38 @@ def test_the_share_of_time_limits_the_checks(monkeypatch):
     for _ in range(1000):
         log(np.ones(2), 2 * np.ones(2))
         now[0] += 10.0
+    log(np.ones(2), 1e3 * np.ones(2))
+    assert log.first == (1000, "explodes"), "the norm needs no check"
     spent = sum(row["seconds"] for row in log.rows[1:])
     assert 0.05 * (now[0] - log.rows[0]["seconds"]) < spent <= 0.1 * (now[0] - log.rows[0]["seconds"])
 
 
-def test_noise_of_the_loop_is_held_in_a_check_and_structures_are_accepted():
-    data, log = (
-        np.random.default_rng(0).normal(size=64),
-        bench.watch(
-            lambda p, w: float(((p["slope"] * data[w.astype(int)] + p["bias"]) ** 2).mean()), every=1, share=math.inf
-        ),
-    )
-    for factor in (1.0, 1.0, 2.0):
-        batch, p = np.random.default_rng(1).integers(64, size=8), {"slope": 0.5, "bias": np.ones(1)}
-        rest = factor * 2 * (p["slope"] * data[batch] + p["bias"])
-        log(p, {"slope": (rest * data[batch]).mean(), "bias": np.array([rest.mean()])}, batch)
-    assert [row["reason"] for row in log.rows] == [""] * 3
-    assert log.first[0] == 2
+@pytest.mark.parametrize("is_closed_over", [True, False])
+def test_what_changes_in_a_loop_in_jax_is_that_of_the_iteration(is_closed_over):
+    """Data and a key of integers, closed over by the cost or given as w; the last gradient is twice too large."""
+    jax = pytest.importorskip("jax")
+    loss = jax.jit(lambda p, w: ((p["slope"] * w["data"] + jax.random.normal(w["key"], (3,))) ** 2).mean())
+    now, p = {}, {"slope": jax.numpy.array(0.5)}
+    log = bench.watch((lambda p: loss(p, now)) if is_closed_over else loss, every=1, share=math.inf)
+    for i, factor in enumerate((1, 1, 1, 2)):
+        now = {"data": jax.numpy.arange(3.0) + i, "key": jax.random.PRNGKey(i)}
+        log(p, {"slope": factor * jax.grad(loss)(p, now)["slope"]}, *() if is_closed_over else (now,))
+    assert [row["reason"] for row in log.rows] == [""] * 4
+    assert log.first[0] == 3
 
 
 @pytest.mark.parametrize(
-    ("gradient", "reason"), [(np.array([math.nan, 1.0]), "nan_gradient"), (np.array([2.0, -2.0]), "wrong_adjoint")]
+    ("theta", "gradient", "reason"),
+    [
+        (1.0, [math.nan, 1.0], "nan_gradient"),
+        (1.0, [2.0, -2.0], "wrong_adjoint"),
+        (math.nan, [math.nan, 1.0], "not_finite"),
+        (1e200, [math.inf, 1.0], "not_finite"),
+    ],
 )
-def test_wrong_numbers_are_named(gradient, reason):
+def test_wrong_numbers_are_named(theta, gradient, reason):
     log = bench.watch(lambda x: float(x @ x), every=1, share=math.inf)
-    log(np.ones(2), gradient)
+    log(np.array([theta, 1.0]), np.array(gradient))
     assert log.first == (0, reason)
 
 
@@ -144,8 +144,7 @@ def test_a_failing_cost_does_not_end_the_loop(tmp_path):
     log(np.ones(2), np.ones(2))
     log(np.ones(2), np.ones(3))
     assert log.first is None
-    assert "2 not" in str(log)
-    assert "missing" in str(log)
+    assert "2 not: UserError: the cost cannot be called at theta: KeyError: 'missing'" in str(log)
     with (tmp_path / "log.csv").open() as file:
         assert [row["iteration"] for row in csv.DictReader(file)] == ["0", "1"]
 

@@ -17,8 +17,7 @@ FINAL = {"shac": -530.0, "shac[window=8]": -700.0, "ppo": -900.0}
 
 def made_up(final=FINAL, seeds=range(5), spread=10.0, **columns):
     """Return an experiment and its rows: a curve of three evaluations per run, noise of ``spread`` between seeds."""
-    names = ",".join(f'"{name}"' for name in final)
-    experiment = config.load([*BASE, f"trainers=[{names}]", f"sweep.seed={list(seeds)}"])
+    experiment = config.load([*BASE, f"trainers={list(final)}", f"sweep.seed={list(seeds)}"])
     rows, rng = [], np.random.default_rng(0)
     for cell in cells(experiment):
         row = blank_row(experiment, cell)
@@ -67,7 +66,6 @@ def test_a_setting_is_chosen_on_seeds_that_are_not_reported():
     summary = tables_of(experiment, rows)["summary"].frame.set_index("method")
     assert summary["verdict"].to_dict() == {"shac": "first", "shac[window=8]": "not chosen", "ppo": "behind"}
     assert set(summary["seeds"]) == {6}
-    assert summary.loc["shac[window=8]", "final"] > summary.loc["shac", "final"]
 
 
 @pytest.mark.parametrize(("count", "reported"), [(5, 5), (7, 7), (8, 5), (10, 6)])
@@ -77,9 +75,7 @@ def test_seeds_choose_only_where_enough_are_left_for_a_test(count, reported):
     assert summary["final_low"].notna().all()
 
 
-@pytest.mark.parametrize(
-    ("own", "verdict"), [(-500.0, "not chosen"), (-300.0, "not run")], ids=["worse", "better than the reported"]
-)
+@pytest.mark.parametrize(("own", "verdict"), [(-500.0, "not chosen"), (-300.0, "not run")])
 def test_a_setting_with_only_the_seeds_that_choose_counts_as_tried(own, verdict):
     experiment, rows = made_up({"shac": -400.0, "shac[window=8]": own, "ppo": -900.0}, range(9), spread=1.0)
     rows = rows[(rows["trainer"] != "shac[window=8]") | (rows["seed"] < 3)]
@@ -104,7 +100,6 @@ def test_few_seeds_give_no_interval_and_no_order():
         ends = frame.filter(regex="^(final|cost)_(low|high)$")
         assert ends.shape[1] == 2
         assert ends.isna().all().all()
-    assert set(frames["summary"]["seeds"]) == {4}
 
 
 def test_windows_that_are_not_distinguishable_from_the_best_are_tied():
@@ -133,7 +128,7 @@ def test_a_run_that_is_not_finite_counts_as_its_untrained_policy():
     rows.at[0, "curve_return"], rows.at[0, "curve_step"] = [-2000.0, np.nan], [0, 5e5]
     runs = studied.runs_of(experiment, rows)
     assert studied.final_returns(runs)[0] == -2000.0
-    assert np.isfinite(studied.curves_of(runs)["cost"]).all()
+    assert np.isfinite(studied.curves_of(runs)[["time", "cost"]]).all(axis=None)
     assert studied.summarise(runs)["failed"].tolist() == [1]
 
 

@@ -58,7 +58,6 @@ PLANTED = {
     "an array with a wrong gradient": ({"slope_errors": [1e-7, np.nan, 9.0]}, "differences", None),
     "opposed gradients": ({"cosine": [-0.5, -0.4, -0.45]}, "opposed", None),
     "ascent": ({"curve_return": [-100.0, -120, -140, -150, -170]}, "falls", 0),
-    "ascent at a flat loss": ({"curve_return": [-100.0, -120, -140, -150, -170], "log_loss": np.ones(N)}, "falls", 0),
     "a collapse at the end": ({"curve_return": [-100.0, -80.0, -60.0, -50.0, -90.0]}, "falls", 75),
     "a soft contact": ({"log_penetration": DEEPER}, "soft_contact", None),
     "parameters that grow 90 times": (entries("log_parameter_largest", slice(60, None), 90.0), "parameters", 61),

@@ -57,7 +57,7 @@ FAULTS = (
     Column("value"),
 )
 COST = interval("cost", label="minus the return of an episode", ends="95% interval over seeds")
-STEP = Column("step", label="control steps", log=False)
+STEP, TIME = Column("step", label="control steps", log=False), Column("time", label="time of the updates", unit="s")
 SEEDS = f"interquartile mean over seeds, with its 95% bootstrap interval from {MIN_SEEDS} seeds on"
 MIDDLES = "lower is better; interquartile mean over seeds"
 NOTE = (
@@ -219,35 +219,32 @@ def is_lower(returns: np.ndarray, others: np.ndarray) -> bool:
     return bool(len(returns) >= MIN_SEEDS and test.pvalue < 0.05 and is_above)
 
 
-def middle_with_interval(name: str, values: np.ndarray) -> dict[str, float]:
-    """Return an interquartile mean and its bootstrap interval by column; no interval for fewer than :data:`MIN_SEEDS` values."""
-    ends = math.nan, math.nan
+def middle_with_interval(name: str, values: np.ndarray) -> dict[str, Any]:
+    """Return interquartile means over the first axis and their bootstrap intervals by column, of fewer than :data:`MIN_SEEDS` NaN."""
+    low = high = np.full(values.shape[1:], math.nan)[()]
     if len(values) >= MIN_SEEDS:
-        ends = bootstrap([values], lambda drawn: interquartile_mean(drawn[0]))
-    return dict(zip((name, f"{name}_low", f"{name}_high"), (interquartile_mean(values), *ends), strict=True))
+        low, high = bootstrap([values], _middle)
+    return dict(zip((name, f"{name}_low", f"{name}_high"), (_middle([values]), low, high), strict=True))
+
+
+def _middle(drawn: Sequence[np.ndarray]) -> Any:
+    return np.apply_along_axis(interquartile_mean, 0, drawn[0])[()]
 
 
 def curves_of(runs: pd.DataFrame) -> pd.DataFrame:
     """Return a line per problem, method and evaluation: cost of an episode, interquartile mean over seeds with interval.
 
-    The cost is minus the return. A run that ended early keeps the cost of its untrained policy from there on.
+    The cost is minus the return, and the time the median over runs. A run that ended early keeps the cost of its untrained
+    policy from there on.
     """
-    names = ["problem", "method", "step", "cost", "cost_low", "cost_high"]
     parts = []
     for (problem, method), part in runs.groupby(["problem", "method"], sort=False):
         curves = np.array([*zip_longest(*part["curve_return"], fillvalue=math.nan)], dtype=float).T
         costs = -np.where(np.isfinite(curves), curves, curves[:, :1])
-        low, high = np.full((2, costs.shape[1]), math.nan)
-        if len(part) >= MIN_SEEDS:
-            low, high = bootstrap([costs], lambda drawn: _middle(drawn[0]))
-        steps = np.asarray(max(part["curve_step"], key=len), dtype=float)
-        parts.append(pd.DataFrame(dict(zip(names, (problem, method, steps, _middle(costs), low, high), strict=True))))
+        steps, times = max(part["curve_step"], key=len), pd.DataFrame([*part["curve_s"]]).median()
+        named = {"problem": problem, "method": method, "step": np.asarray(steps, dtype=float), "time": times}
+        parts.append(pd.DataFrame(named | middle_with_interval("cost", costs)))
     return pd.concat(parts, ignore_index=True)
-
-
-def _middle(costs: np.ndarray) -> np.ndarray:
-    """Return the interquartile mean of each column."""
-    return np.array([interquartile_mean(column) for column in costs.T])
 
 
 def windows_of(runs: pd.DataFrame) -> pd.DataFrame:
@@ -308,9 +305,16 @@ def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
         "train", frame.dropna(subset=["step"]), [STEP], [cost], series="method", panel="problem", band=True,
         subtitle=MIDDLES,
     )  # fmt: skip
+    times = replace(
+        curves,
+        name="times",
+        x=[TIME],
+        title="The same returns against the time of the updates",
+        text="The median time over seeds, beside other work.",
+    )
     final = windows.assign(cost=-windows["final"], cost_low=-windows["final_high"], cost_high=-windows["final_low"])
     lengths = Chart(
         "windows", final, [replace(WINDOW, log=True)], [cost], series="family", panel="problem",
         title="What does the length of a window do?", subtitle=f"after training; {MIDDLES}",
     )  # fmt: skip
-    return [replace(one, styles=method_styles(one.frame[one.series].unique())) for one in (curves, lengths)]
+    return [replace(one, styles=method_styles(one.frame[one.series].unique())) for one in (curves, times, lengths)]
