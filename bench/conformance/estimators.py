@@ -105,7 +105,7 @@ class Oracle(NamedTuple):
     @property
     def plain(self) -> np.ndarray:
         """The gradient of the cost without noise, ``(d,)``."""
-        return self.problem.grad(self.program.theta0, np.zeros((self.program.n_noise, 1)))[:, 0]
+        return self.problem.grad()
 
 
 @cache

@@ -7,6 +7,7 @@ import math
 import os
 import re
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import replace
 from functools import lru_cache
@@ -33,12 +34,11 @@ from bench.host import guard
 from bench.host.identity import parse_identity
 from bench.host.parameters import Parameter, build, check, coerce, parameters, remember, singular
 from bench.model import Decision, MechanicalScene, Plugin, registry
+from bench.simulator.clock import parse_duration
 
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 RESERVED = ("claims", "references", "standard", "trace")
 """Names of folders under ``results_dir`` that are not experiments."""
-SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
-BYTES = {"k": 2.0**10, "m": 2.0**20, "g": 2.0**30}
 
 
 def config_dir() -> Path:
@@ -424,11 +424,11 @@ def _compile_cache(value: Any) -> Path | None:
 
 
 def _execution(config: Mapping[str, Any]) -> Execution:
-    memory = _amount("memory", config["memory"], BYTES, "4g, 500m")
+    timeout = config["timeout"]
     return Execution(
         workers=check(Parameter("workers", int | None, None, low=0), config["workers"], "workers"),
-        timeout=_amount("timeout", config["timeout"], SECONDS, "600, 10m"),
-        memory=None if memory is None else math.ceil(memory),
+        timeout=None if timeout is None else parse_duration(timeout, "timeout"),
+        memory=_bytes(config["memory"]),
         stop=_one_of("on_error", config["on_error"], ("continue", "stop")) == "stop",
         ladder=coerce(bool, config["ladder"], "ladder"),
         versions=_one_of("versions", config["versions"], ("ignore", "warn", "rerun")),
@@ -457,19 +457,17 @@ def _one_of(key: str, value: Any, allowed: Sequence[str]) -> str:
     return str(value)
 
 
-def _amount(key: str, value: Any, units: Mapping[str, float], example: str) -> float | None:
-    """Return an amount such as ``10m`` as a number of base units, greater than 0, or None for no limit."""
+def _bytes(value: Any) -> int | None:
+    """Return an amount of memory such as ``4g`` in bytes, greater than 0, or None for no limit."""
     if value is None:
         return None
-    text = str(value).strip().lower()
-    number, unit = (text[:-1], text[-1:]) if text[-1:] in units else (text, "")
-    try:
-        amount = float(number) * units.get(unit, 1.0)
-    except ValueError:
-        amount = math.nan
-    if isinstance(value, bool) or not 0 < amount < math.inf:
-        raise UserError(f"{key}={value!r} must be an amount such as {example}, greater than 0, or null for no limit")
-    return amount
+    text, amount = str(value).strip().lower(), math.nan
+    unit = {"k": 2.0**10, "m": 2.0**20, "g": 2.0**30}.get(text[-1:])
+    with suppress(ValueError):
+        amount = float(text[:-1] if unit else text) * (unit or 1.0)
+    if not 0 < amount < math.inf:
+        raise UserError(f"memory={value!r} must be an amount such as 4g, 500m, greater than 0, or null for no limit")
+    return math.ceil(amount)
 
 
 def _mapping(config: Mapping[str, Any], key: str, allowed: Collection[str] = ()) -> dict[str, Any]:

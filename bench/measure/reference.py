@@ -127,8 +127,7 @@ def certify(
             reference = with_note(reference, note)
     if physical is None or "grad" not in provides:
         return reference
-    plain = problem.grad(theta, np.zeros((program.n_noise, 1)))[:, 0]
-    return replace(reference, plain=plain, physical=np.asarray(physical, dtype=np.float64))
+    return replace(reference, plain=problem.grad(), physical=np.asarray(physical, dtype=np.float64))
 
 
 def transferred(reference: Reference, problem: Problem, other: Problem, samples: int, unit: float) -> Reference | None:

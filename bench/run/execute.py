@@ -22,8 +22,9 @@ from bench.experiment.parameters import completed_rows
 from bench.experiment.study import study_of
 from bench.host import guard, reads
 from bench.measure import timing
+from bench.measure.descent import DescentPath
 from bench.model import Estimator
-from bench.run import descents, progress
+from bench.run import progress
 from bench.run.files import remove_stale
 from bench.run.ladder import climb
 from bench.run.launchers import Launcher, launcher_of
@@ -31,6 +32,7 @@ from bench.run.plan import Planned, plan
 from bench.run.pool import TaskResult
 from bench.run.record import kind_of_machine
 from bench.run.session import RunSession
+from bench.run.shared import Shared
 from bench.run.store import Store, sort_rows
 from bench.run.tasks import FAILED, Task, group_by_program, result_of, row_of
 
@@ -184,19 +186,21 @@ class Runner:
         A descent is computed once, stored, and shared by all cells of its scene.
         """
         starts = {cell.path.descent_key: cell.path for cell in cells if cell.path is not None}
-        folder = self.experiment.results_dir.absolute() / "references"
-        known = {key: descents.load(folder, key) for key in starts}
-        due = [start.with_part("backend", start.descent_backend) for key, start in starts.items() if known[key] is None]
-        failed: dict[str, dict[str, Any]] = {}
+        shared, known, failed = Shared(self.experiment), dict[str, DescentPath](), dict[str, dict[str, Any]]()
+        for key in starts:
+            with suppress(TypeError):  # none is stored, or it is no path
+                known[key] = DescentPath(**(shared.load(f"descent_{key}") or {}))
+        due = [start.with_part("backend", start.descent_backend) for key, start in starts.items() if key not in known]
         if due:
             with launcher_of(self.experiment) as launcher:
-                tasks = [Task(start, descent=True) for start in due]
-                for answer in itertools.chain.from_iterable(self._answers(tasks, launcher)):
+                answers = itertools.chain.from_iterable(
+                    self._answers([Task(start, descent=True) for start in due], launcher)
+                )
+                for answer in answers:
                     key = answer.item.cell.descent_key
                     if answer.result["status"] == "ok":
-                        known[key] = descents.save(
-                            folder, key, answer.result["descent"], answer.result.get("reads", "")
-                        )
+                        known[key] = DescentPath(**answer.result["descent"])
+                        shared.save(f"descent_{key}", answer.result["descent"], answer.result.get("reads", ""))
                     else:
                         failed[key] = result_of(answer, "its descent: ")
         placed: list[Cell] = []
@@ -204,24 +208,26 @@ class Runner:
             key = "" if cell.path is None else cell.path.descent_key
             if not key:
                 placed.append(cell)
-            elif (found := known[key]) is not None and not found.reason:
-                placed.append(replace(cell, point=found.at(cell.decision.descent)))
+            elif key in failed:
+                self._finish([(cell, failed[key])])
+            elif known[key].reason:
+                reason = {"status": "unsupported", "reason": f"no descent: {known[key].reason}"}
+                self._finish([(cell, reason | {"machine": kind_of_machine()})])
             else:
-                reason = {"status": "unsupported", "reason": f"no descent: {found.reason if found else ''}"}
-                self._finish([(cell, failed.get(key, reason | {"machine": kind_of_machine()}))])
+                placed.append(replace(cell, point=known[key].at(cell.decision.descent)))
         return placed
 
     def _compute_references(self, cells: list[Cell], references: list[Cell], launcher: Launcher) -> list[Cell]:
         """Compute references and return the cells to measure; cells whose reference failed are stored with its status."""
         tasks = [Task(_for_reference(cell), reference=True) for cell in references]
-        failed: dict[str, dict[str, Any]] = {}
-        for answer in itertools.chain.from_iterable(self._answers(tasks, launcher)):
-            if answer.result["status"] != "ok":
-                failed[answer.item.cell.reference_key] = result_of(answer, "its reference gradient: ")
-        if not failed:
-            return cells
-        self._finish([(cell, failed[cell.reference_key]) for cell in cells if cell.reference_key in failed])
-        return [cell for cell in cells if cell.reference_key not in failed]
+        failed = {
+            answer.item.cell.reference_key: result_of(answer, "its reference gradient: ")
+            for answer in itertools.chain.from_iterable(self._answers(tasks, launcher))
+            if answer.result["status"] != "ok"
+        }
+        lost = {cell.key for cell in cells if cell.budget is not None and cell.reference_key in failed}
+        self._finish([(cell, failed[cell.reference_key]) for cell in cells if cell.key in lost])
+        return [cell for cell in cells if cell.key not in lost]
 
     def _measure(self, cells: list[Cell], launcher: Launcher) -> None:
         for answers in self._answers([Task(cell) for cell in cells], launcher):

@@ -377,5 +377,5 @@ def test_a_backend_asked_for_references_moves_and_doubles_nothing(tmp_path, work
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("Written:") == 1
     assert (tmp_path / "here" / "out" / "custom" / "rows.parquet").exists()
-    assert list((tmp_path / "here" / "out" / "references").glob("*.parquet"))
+    assert list((tmp_path / "here" / "out" / "references").glob("*.json"))
     assert not list((tmp_path / "elsewhere").iterdir())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,8 +16,9 @@ from scipy.special import chdtri
 from bench.errors import Unsupported
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
-from bench.host.parameters import named
+from bench.host.parameters import parameters
 from bench.measure import noise, performance
+from bench.model import Program
 
 from .. import norm
 from . import Identify, adequacy
@@ -132,10 +134,10 @@ def _intervals(fit: Fit, known: Information, theta: np.ndarray) -> _Intervals:
     return _Intervals(estimate, size, half, low, high, kind)
 
 
-def _units(model: Model, names: tuple[str, ...]) -> dict[str, str]:
-    """Return the units of unknowns; empty for entries of the initial state."""
-    parts = [*map(type, model.program.parts.values())]
-    return {name: (part.unit or "1") if (part := named(parts, name)) else "" for name in names}
+def _units(program: Program, names: tuple[str, ...]) -> dict[str, str]:
+    """Return the units of unknowns; empty for entries of the initial state, which follow the parameters."""
+    units = [parameters(type(program.parts[axis]))[name].unit or "1" for axis, name in program.named]
+    return dict(itertools.zip_longest(names, units, fillvalue=""))
 
 
 def _estimates(fit: Fit, known: Information, start: np.ndarray, own: Mapping[str, str]) -> dict[str, Any]:
@@ -149,7 +151,7 @@ def _estimates(fit: Fit, known: Information, start: np.ndarray, own: Mapping[str
     names = list(dict.fromkeys([*known.labels, *known.names]))
     exponents = np.concatenate([invariants, np.eye(p)[[known.names.index(name) for name in names[rank:]]]])
     is_seen = (np.abs(exponents @ invariants.T) > SHARE).any(axis=1)
-    units = _units(model, known.names)
+    units = _units(model.program, known.names)
     factors = tuple(f"({unit})" if {*unit} & {*" /"} else unit or "1" for unit in units.values())
     intervals, nothing = _intervals(fit, known, theta), [math.nan] * (len(names) - rank)
     result = {
