@@ -135,12 +135,6 @@ class Cell:
             raise Unsupported(f"no installed backend computes a descent of scene {self.scene.name}")
         return ranked[0]
 
-    @property
-    def _path_key(self) -> str:
-        with suppress(Unsupported):  # the cell is refused
-            return "" if self.path is None else self.path.descent_key
-        return "none"
-
     @cached_property
     def reference_key(self) -> str:
         """Hash of everything that decides the reference gradient; raises ValueError if the study computes none."""
@@ -158,7 +152,7 @@ class Cell:
                 radius = [] if smoothing is None else [[smoothing.shape, smoothing.radius]]
                 if smoothing is None:
                     methods = reference.revisions(self.program(), self.reference_backends[0].provides)
-            budget = list(counted(self.budget).values()) if self.budget else []
+            budget = list(counted(self.budget).values())
             _reference_keys[given] = hashed(self.program_key, budget, backend, *radius, raised(methods))
         return _reference_keys[given]
 
@@ -206,7 +200,9 @@ class Cell:
         theta = self._theta()
         if theta is None or self.path is None:
             return theta and {name: theta[name] for name in ("names", "at")}
-        return theta | {"path": self._path_key}
+        with suppress(Unsupported):
+            return theta | {"path": self.path.descent_key}
+        return theta | {"path": "none"}  # the cell is refused
 
     def columns(self) -> dict[str, Any]:
         """Return the identity columns of the cell's row: views of its parameters and counts."""

@@ -152,7 +152,8 @@ def _composed_files(name: str, config_dirs: tuple[Path, ...], stamps: object) ->
 
     words, own = [], {}
     if name:
-        words, own = [f"+experiment={name}"], check_file(_file_of(name, config_dirs))
+        files = (folder / "experiment" / f"{name}.yaml" for folder in (*config_dirs, config_dir()))
+        words, own = [f"+experiment={name}"], check_file(next(file for file in files if file.exists()))
     if config_dirs:
         search_path = ",".join(f"'file://{folder.expanduser().absolute()}'" for folder in config_dirs)
         words.insert(0, f"hydra.searchpath=[{search_path}]")
@@ -184,12 +185,6 @@ def _joined(
         if other.study != main.study:
             raise UserError(f"also: {name} has another study or other settings of it than {main.name}")
     return replace(main, also=also)
-
-
-def _file_of(name: str, config_dirs: Sequence[Path]) -> Path:
-    """Return the file of an experiment, of the user's or of this package."""
-    folders = [folder / "experiment" for folder in (*config_dirs, config_dir())]
-    return next(path for folder in folders if (path := folder / f"{name}.yaml").exists())
 
 
 def _known_keys() -> frozenset[str]:

@@ -57,7 +57,7 @@ class Study(Plugin):
 
     def compares(self, parts: Mapping[str, Plugin | None]) -> bool:
         """Return whether a cell with these plugins needs a reference gradient; by default if the rows have its method."""
-        return self.columns.referenced
+        return "reference_method" in self.columns.by_name
 
     def refusal(self, cell: Cell) -> str | None:
         """Return why the study cannot measure a cell, or None; called when a run is planned."""

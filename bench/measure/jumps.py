@@ -83,13 +83,8 @@ class Sampled(NamedTuple):
 def sampled_gradients(problem: Problem, theta: np.ndarray, seed: int, columns: int) -> Sampled:
     """Return what samples of the noise show of costs and gradients at ``theta (d,)``."""
     w = np.random.default_rng([seed, 0x6C6F7374]).standard_normal((problem.program.n_noise, DRAWS))
-
-    def both(part: np.ndarray) -> np.ndarray:
-        at = np.repeat(theta[:, None], part.shape[1], axis=1)
-        return np.concatenate([problem.value(at, part)[None], problem.grad(at, part)])
-
     with np.errstate(all="ignore"):
-        found = in_columns(both, w, columns)
+        found = _costs_and_gradients(problem, theta, w, columns)
         variance = float(found[1:].var(axis=1, ddof=1).sum())
         square = float(np.square(found[1:].mean(axis=1)).sum()) - variance / DRAWS
         spread = math.sqrt(variance / square) if square > 0.0 and math.isfinite(variance) else math.inf
@@ -101,6 +96,17 @@ def sampled_gradients(problem: Problem, theta: np.ndarray, seed: int, columns: i
         return Lost(float(bad.mean()), w[:, nearest[0]] if nearest.size else np.zeros(len(w)))
 
     return Sampled(lost(has_cost & ~has_gradient), lost(~has_cost), spread)
+
+
+def _costs_and_gradients(problem: Problem, theta: np.ndarray, w: np.ndarray, columns: int) -> np.ndarray:
+    """Return costs and gradients at ``theta (d,)`` under noise ``w (n_w, B)``, ``(1 + d, B)``."""
+
+    def both(part: np.ndarray) -> np.ndarray:
+        # one theta per column, the shape that a compiling backend has compiled for differences
+        at = np.repeat(theta[:, None], part.shape[1], axis=1)
+        return np.concatenate([problem.value(at, part)[None], problem.grad(at, part)])
+
+    return in_columns(both, w, columns)
 
 
 def missed_slope(problem: Problem, theta: np.ndarray, seed: int, columns: int) -> MissedSlope:
@@ -117,16 +123,11 @@ def missed_slope(problem: Problem, theta: np.ndarray, seed: int, columns: int) -
         return nothing
     directions = _lines_of_slopes(dim, np.random.default_rng([seed, 0x736C6F70]))
     t = np.linspace(-FAR, FAR, NODES)
-    points = (directions[:, :, None] * t).reshape(dim, -1)
-
-    def along(part: np.ndarray) -> np.ndarray:
-        w = np.concatenate([part, np.zeros((width - dim, part.shape[1]))])
-        at = np.repeat(theta[:, None], part.shape[1], axis=1)
-        return np.concatenate([problem.value(at, w)[None], problem.sigma * problem.grad(at, w)])
-
+    points = np.zeros((width, directions.shape[1] * NODES))
+    points[:dim] = (directions[:, :, None] * t).reshape(dim, -1)
     with np.errstate(all="ignore"):
-        both = in_columns(along, points, columns).reshape(dim + 1, -1, NODES)
-        costs, slopes = both[0], np.einsum("dl,dlt->lt", directions, both[1:])
+        both = _costs_and_gradients(problem, theta, points, columns).reshape(dim + 1, -1, NODES)
+        costs, slopes = both[0], np.einsum("dl,dlt->lt", directions, problem.sigma * both[1:])
         density = np.exp(-t * t / 2.0) / np.sqrt(2.0 * np.pi) * (t[1] - t[0])
         by_costs = (costs - costs[:, NODES // 2, None]) * t * density
         by_gradients = np.where(np.abs(t) <= MET, slopes, 0.0) * density
@@ -151,10 +152,17 @@ def missed_slope(problem: Problem, theta: np.ndarray, seed: int, columns: int) -
     return MissedSlope(float(shares[line]), w)
 
 
+def coordinates(width: int, most: int) -> np.ndarray:
+    """Return the unit vectors of at most ``most`` evenly spaced coordinates, ``(width, L)``."""
+    chosen = np.unique(np.linspace(0, width - 1, min(width, most)).astype(int))
+    units = np.zeros((width, chosen.size))
+    units[chosen, np.arange(chosen.size)] = 1.0
+    return units
+
+
 def _lines_of_slopes(dim: int, random: np.random.Generator) -> np.ndarray:
     """Return unit vectors ``(d, L)``: coordinates, diagonals of pairs and of all inputs where there are few, random ones."""
-    chosen = np.unique(np.linspace(0, dim - 1, min(dim, LINES)).astype(int))
-    rows = list(np.eye(dim)[chosen])
+    rows = list(coordinates(dim, LINES).T)
     if 1 < dim <= SIGNED:
         signs = np.array(np.meshgrid(*[(-1.0, 0.0, 1.0)] * dim)).reshape(dim, -1).T
         first = signs[np.arange(len(signs)), (signs != 0).argmax(axis=1)]
@@ -183,10 +191,7 @@ def jump_under_noise(problem: Problem, theta: np.ndarray, seed: int, columns: in
 
     changes = cost(samples)
     changes = np.where(np.isfinite(changes), changes - np.nan_to_num(np.median(changes)), 0.0)
-    chosen = np.unique(np.linspace(0, width - 1, min(width, LINES)).astype(int))
-    units = np.zeros((width, chosen.size))
-    units[chosen, np.arange(chosen.size)] = 1.0
-    directions = np.concatenate([units, samples[:, :LINES], (samples @ changes)[:, None]], axis=1)
+    directions = np.concatenate([coordinates(width, LINES), samples[:, :LINES], (samples @ changes)[:, None]], axis=1)
     lengths = np.linalg.norm(directions, axis=0)
     directions = directions[:, lengths > 0.0] / lengths[lengths > 0.0]
     pairs = samples[:, : 2 * LINES], samples[:, 2 * LINES :]

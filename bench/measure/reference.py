@@ -11,7 +11,7 @@ import numpy as np
 
 from bench.measure import noise
 from bench.measure.batches import in_columns
-from bench.measure.jumps import largest_jump
+from bench.measure.jumps import coordinates, largest_jump
 from bench.measure.quadrature import TOLERANCE, integrate
 from bench.measure.statistics import THREE, Sampling, Truth, bias_interval, heavy_tails
 from bench.model import Problem, Program
@@ -495,10 +495,7 @@ class _Sampler:
 
 def _directions(effect: np.ndarray) -> np.ndarray:
     """Return unit vectors in noise space, ``(n_w, L)``: evenly spaced coordinates, and the mean effect's direction."""
-    width = effect.size
-    chosen = np.unique(np.linspace(0, width - 1, min(width, DIRECTIONS)).astype(int))
-    directions = np.eye(width)[:, chosen] if width <= DIRECTIONS else np.zeros((width, chosen.size))
-    directions[chosen, np.arange(chosen.size)] = 1.0
+    directions = coordinates(effect.size, DIRECTIONS)
     length = float(np.linalg.norm(effect))
     return np.column_stack([directions, effect / length]) if length and math.isfinite(length) else directions
 

@@ -119,11 +119,6 @@ class Truth:
     """Norm of an error of unknown direction that ``sampling`` does not show."""
 
     def __post_init__(self) -> None:
-        if self.mean.ndim != 1 or self.mean.size == 0 or self.sampling.rows.shape[1:] != self.mean.shape:
-            raise ValueError(
-                f"a reference gradient is a vector (d,) with errors (K, d), d > 0; given {self.mean.shape} "
-                f"with errors {self.sampling.rows.shape}"
-            )
         finite = np.isfinite(self.mean).all() and np.isfinite(self.sampling.rows).all()
         if not (finite and math.isfinite(self.unseen)):
             raise ValueError("the reference gradient or its error is not finite, so nothing can be compared with it")
@@ -140,9 +135,6 @@ class Truth:
 
         ``unseen`` is the norm of an error that this spread does not show.
         """
-        batches = np.asarray(batches, dtype=np.float64)
-        if batches.ndim != 2 or len(batches) < 2:
-            raise ValueError(f"batch means have the shape (K, d) with K > 1; given {batches.shape}")
         return cls(batches.mean(axis=0), Sampling.of(batches), unseen)
 
     @property
@@ -318,13 +310,7 @@ def variance_per_sample(sums: np.ndarray, squares: np.ndarray, samples: int) -> 
     first. The interval is the jackknife over repeats of :func:`variance_interval`, which accounts for tails. It is
     ``(0, inf)`` for fewer than three repeats, and NaN where there is only one term in total.
     """
-    sums, squares = np.asarray(sums, dtype=np.float64), np.asarray(squares, dtype=np.float64)
     repeats = len(sums)
-    if sums.ndim != 2 or squares.shape != (repeats,) or repeats < 1 or samples < 1:
-        raise ValueError(
-            f"sums have the shape (R, d) and squares (R,) with R > 0 and one sample or more; given {sums.shape}, "
-            f"{squares.shape} and {samples}"
-        )
     count = repeats * samples
     if count < 2:
         return (math.nan,) * 3

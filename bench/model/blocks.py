@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
@@ -87,15 +87,10 @@ def evaluate(
         values = function(theta if shared else _pad(theta[:, part], columns), _pad(w[:, part], columns))
         result[..., part] = values[..., : part.stop - part.start]
 
-    _run_blocks(block, range(0, count, columns), threads)
-    return result
-
-
-def _run_blocks(block: Callable[[int], None], starts: Sequence[int], threads: int) -> None:
-    """Call ``block`` with each start, in this thread or in ``threads`` others."""
     # one pool per process: a forked child inherits the pool but not its threads
     run = _pool(threads, os.getpid()).map if threads > 1 else map
-    list(run(block, starts))
+    list(run(block, range(0, count, columns)))
+    return result
 
 
 def _pad(part: np.ndarray, columns: int) -> np.ndarray:

@@ -327,8 +327,10 @@ class Rollout(Program):
     @property
     def noise_on_theta(self) -> bool:
         """Whether noise is on theta: parameter noise, or action noise if theta is only the sequence of controls."""
-        plans_controls = self.scene.open_loop and self._only_controls and not self._moves_start
-        return not self.action_noise or plans_controls
+        # the default control law without feedback: u_t = theta_t + sigma w_t if open-loop
+        scene, laws = type(self.scene), ("planned_controls", "feedback")
+        is_default = all(getattr(scene, law) is getattr(MechanicalScene, law) for law in laws)
+        return not self.action_noise or (scene.open_loop and is_default and not self._moves_start)
 
     @property
     def is_open_loop(self) -> bool:
@@ -345,12 +347,6 @@ class Rollout(Program):
             f"theta sets the initial state of scene {self.scene.name} while noise is on the actions, so that cost times "
             "score is not the gradient: use noise=parameter"
         )
-
-    @property
-    def _only_controls(self) -> bool:
-        """Whether the scene uses the default control law, without feedback: u_t = theta_t + sigma w_t if open-loop."""
-        scene = type(self.scene)
-        return all(getattr(scene, law) is getattr(MechanicalScene, law) for law in ("planned_controls", "feedback"))
 
     @cached_property
     def _moves_start(self) -> bool:

@@ -79,9 +79,7 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     store = store_of(experiment)
     planned = plan(experiment, store)
     _refuse_without_supported_cells(experiment, planned)
-    progress.print_versions(planned, experiment.execution.versions)
-    progress.print_machines(planned)
-    progress.print_stale(planned)
+    progress.print_states(planned, experiment.execution.versions)
     store.prepare()
     for folder in (experiment.directory, experiment.directory / "pending", experiment.results_dir / "references"):
         remove_stale(folder)
@@ -271,16 +269,12 @@ class Runner:
         if self.experiment.execution.stop:
             for row in rows:
                 if row["status"] in FAILED:
-                    raise _stopped_by(row)
+                    names = " ".join(str(row[name]) for name in ("scene", "backend", "estimator") if row.get(name))
+                    raise Stopped(f"after a failed cell ({names}: {row['status']}, {row['reason']})")
 
 
 class Stopped(Exception):
     """Raised when a run ends before its last cell: a cell failed in a run with ``on_error=stop``, or rows are missing."""
-
-
-def _stopped_by(row: dict[str, Any]) -> Stopped:
-    names = " ".join(str(row[name]) for name in ("scene", "backend", "estimator") if row.get(name))
-    return Stopped(f"after a failed cell ({names}: {row['status']}, {row['reason']})")
 
 
 def _for_reference(cell: Cell) -> Cell:

@@ -38,7 +38,12 @@ def write_whole(path: Path, content: bytes | Iterable[bytes]) -> None:
             # the content must be on disk before the name points to it, or a power cut leaves an empty file
             flush_to_disk(file.fileno())
         os.replace(part, path)
-        sync_directory(path.parent)
+        # the entries of the folder too, so that the name survives a power failure
+        descriptor = os.open(path.parent, os.O_RDONLY)
+        try:
+            flush_to_disk(descriptor)
+        finally:
+            os.close(descriptor)
     except BaseException as error:  # also of code that makes the content
         with suppress(OSError):
             part.unlink(missing_ok=True)
@@ -65,15 +70,6 @@ def make_directory(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StorageError(f"'{path}' cannot be written: {error.strerror}") from None
-
-
-def sync_directory(directory: Path) -> None:
-    """Write the entries of a directory to disk, so that renames survive a power failure."""
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        flush_to_disk(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def flush_to_disk(descriptor: int) -> None:

@@ -24,10 +24,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-Identity = tuple[str, float, float, float]
-"""The identity of a cell apart from its code: completed parameters as JSON, samples, repeats and seed."""
-
-
 @dataclass(frozen=True)
 class Planned:
     """A cell, and whether it is stored already, refused or due to run."""
@@ -104,7 +100,11 @@ def requested_rows(experiment: Experiment, rows: pd.DataFrame) -> tuple[pd.DataF
             keys = {cell.key for cell in every}
             is_requested = rows["key"].isin(keys).to_numpy(copy=True)
             others = rows.loc[~is_requested, ["parameters", *COUNTS]]
-            identities = {_identity_of(cell) for cell in every} if len(others) else set()
+            identities = {
+                (completed_json(json.dumps(cell.parameters)), *(getattr(cell, name) for name in COUNTS))
+                for cell in every
+                if len(others)
+            }
     except UserError:
         return rows, ""  # a plugin of the rows may not be installed any more
     facts = zip(others["parameters"].map(completed_json), *(others[name] for name in COUNTS), strict=True)
@@ -121,11 +121,6 @@ def requested_rows(experiment: Experiment, rows: pd.DataFrame) -> tuple[pd.DataF
     hidden = f"{n_others} stored rows of other settings are not shown" if n_others else ""
     shown = rows[is_requested].reset_index(drop=True) if n_others else rows
     return shown, "; ".join(part for part in (missing, hidden) if part)
-
-
-def _identity_of(cell: Cell) -> Identity:
-    parameters = json.dumps(cell.parameters, separators=(",", ":"))
-    return completed_json(parameters), float(cell.samples), float(cell.repeats), float(cell.seed)
 
 
 def expected_seconds(runs: Sequence[Planned], rows: pd.DataFrame) -> float:

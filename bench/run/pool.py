@@ -28,6 +28,7 @@ from typing import IO, Any, Literal
 import psutil
 
 from bench.errors import STATUSES, StorageError, UserError, describe_exit, failure
+from bench.experiment.experiment import Execution
 from bench.host import guard
 from bench.model import registry
 from bench.run.reaper import MARK, Reaper, kill_marked_processes
@@ -54,16 +55,6 @@ SINGLE_THREAD = {
     "NPROC": "1",
 }
 """Environment variables that limit numerical libraries to one thread, if set before the libraries are imported."""
-
-
-@dataclass(frozen=True)
-class ResourceLimits:
-    """Limits of one item; None for no limit."""
-
-    timeout: float | None = None
-    """Seconds."""
-    memory: int | None = None
-    """Bytes of resident memory, libraries included."""
 
 
 @dataclass(frozen=True)
@@ -221,7 +212,8 @@ class _Worker:
 class Pool:
     """Workers that share groups of items: a context manager that ends all its processes on exit.
 
-    ``make(argument)`` builds the handler in each worker, with the plugins in ``folders`` available. With
+    ``make(argument)`` builds the handler in each worker, with the plugins in ``folders`` available.
+    ``limits`` has the seconds that an item may take, and the bytes of memory that it may use, libraries included. With
     ``single_thread``, numerical libraries use one thread. ``outside(item)`` are the modules from outside whose code an
     item runs, the same for all items of a group: a worker that has run such code only runs items with the same ones.
     """
@@ -231,7 +223,7 @@ class Pool:
         n_workers: int,
         make: Callable[[Any], Handler],
         argument: Any,
-        limits: ResourceLimits,
+        limits: Execution,
         single_thread: bool = True,
         folders: Sequence[Path] = (),
         outside: Callable[[Any], frozenset[str]] = lambda _: frozenset(),

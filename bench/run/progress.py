@@ -98,33 +98,32 @@ def show_progress(name: str, planned: Sequence[Planned], quiet: bool = False) ->
         yield Progress(name, planned, bars, lines=not (shows_bar or quiet))
 
 
-def print_versions(planned: Sequence[Planned], policy: str) -> None:
-    """Print how many stored rows were computed with other library versions, and whether they are run again."""
-    counts = Counter(item.other_versions for item in planned if item.other_versions)
-    for versions, count in counts.most_common():
-        action = (
-            "they are run again" if policy == "rerun" else "versions=rerun runs them again, versions=ignore keeps quiet"
-        )
-        print(f"bench: {count} stored rows were made with {versions}: {action}", file=sys.stderr)
+def print_states(planned: Sequence[Planned], policy: str) -> None:
+    """Print how many stored rows are of other library versions or machines, or are run again since something has changed.
 
-
-def print_machines(planned: Sequence[Planned]) -> None:
-    """Print how many stored rows were timed on another kind of machine, if this run measures times here."""
-    this = record.kind_of_machine()
-    others = Counter(item.machine for item in planned if item.machine not in ("", this))
-    if others and any(item.runs and item.cell.timing for item in planned):
-        for machine, count in others.most_common():
-            print(
-                f"bench: {count} stored rows were timed on '{machine}', and this machine is '{this}': times of two kinds of "
-                "machine do not compare; choose another folder with name=..., or leave times out with timing=false",
-                file=sys.stderr,
-            )
+    ``policy`` says what happens with those of other versions. Machines count only if this run measures times here.
+    """
+    again = "they are run again" if policy == "rerun" else "versions=rerun runs them again, versions=ignore keeps quiet"
+    _print_counts((item.other_versions for item in planned), f"were made with {{}}: {again}")
+    if any(item.runs and item.cell.timing for item in planned):
+        this = record.kind_of_machine()
+        others = (item.machine for item in planned if item.machine != this)
+        _print_counts(
+            others, f"were timed on '{{}}', and this machine is '{this}': times of two kinds of machine do not compare; choose "
+            "another folder with name=..., or leave times out with timing=false",
+        )  # fmt: skip
+    print_stale(planned)
 
 
 def print_stale(planned: Sequence[Planned]) -> None:
     """Print how many stored rows are run again since something that they have read has changed."""
-    for stale, count in Counter(item.stale for item in planned if item.stale).most_common():
-        print(f"bench: {count} stored rows are stale, and run again: {printable(stale)}", file=sys.stderr)
+    _print_counts((printable(item.stale) for item in planned), "are stale, and run again: {}")
+
+
+def _print_counts(values: Iterable[str], text: str) -> None:
+    """Print how many stored rows have each value that is not empty."""
+    for value, count in Counter(filter(None, values)).most_common():
+        print(f"bench: {count} stored rows {text.format(value)}", file=sys.stderr)
 
 
 def print_others(experiment: Experiment, planned: Sequence[Planned], keys: Iterable[str]) -> None:
