@@ -447,17 +447,14 @@ def _gradcheck(words: list[str]) -> int:
     return 1 if status or study_of(experiment).faults(rows) else 0
 
 
-IN_ENGINES = ("backends=[mujoco]", "contacts=[penalty]")
-"""What ``gradcheck`` and ``trace`` take for scenes that only engines run, unless it is given."""
-
-
 def _with_engine(words: list[str], settings: list[str]) -> Experiment:
-    """Return the experiment of words and settings, with :data:`IN_ENGINES` where only engines run its scenes."""
+    """Return the experiment of words and settings, with a backend and law for scenes that only engines run."""
     from bench.model import EngineScene
 
     experiment = _load([*words, *settings])
     plugins = [choice.entry.plugin for choice in experiment.choices["scene"]]
-    in_engines = [word for word in IN_ENGINES if not _is_given(word.partition("=")[0], settings)]
+    words_of_engines = ("backends=[mujoco]", "contacts=[penalty]")
+    in_engines = [word for word in words_of_engines if not _is_given(word.partition("=")[0], settings)]
     if in_engines and all(plugin and issubclass(plugin, EngineScene) for plugin in plugins):
         print(f"bench: only engines run these scenes: {' '.join(in_engines)}", file=sys.stderr)
         return _load([*words, *in_engines, *settings])

@@ -36,10 +36,6 @@ from bench.host.parameters import Parameter, build, check, coerce, parameters, r
 from bench.model import Decision, MechanicalScene, Plugin, registry
 from bench.simulator.clock import parse_duration
 
-SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
-RESERVED = ("claims", "references", "standard", "trace")
-"""Names of folders under ``results_dir`` that are not experiments."""
-
 
 def config_dir() -> Path:
     """Return the folder of ``config.yaml`` and the experiments: beside the package in a checkout, else inside it."""
@@ -274,9 +270,6 @@ def _in_use(plugins: Sequence[type[Plugin]]) -> list[type[Plugin]]:
     return [plugin for plugin in plugins if plugin.kind not in unused]
 
 
-FORMATS = ("png", "svg", "pdf")
-
-
 def from_settings(config: Mapping[str, Any]) -> Experiment:
     """Return the experiment of a composed configuration; raises :class:`UserError` if a setting is invalid."""
     extra = set(config) - _known_keys()
@@ -314,7 +307,7 @@ def from_settings(config: Mapping[str, Any]) -> Experiment:
         answer=_text(config, "answer"),
         marks=_mapping(config, "marks"),
         compares=_compares(config),
-        formats=tuple(_one_of("formats", item, FORMATS) for item in _as_list(config["formats"])),
+        formats=tuple(_one_of("formats", item, ("png", "svg", "pdf")) for item in _as_list(config["formats"])),
         chart_columns=int(_one_of("chart_columns", str(config["chart_columns"]), ("1", "2"))),
         reference=cast(Budget, build(Budget, _mapping(config, "reference", parameters(Budget)))),
         compile_cache=_compile_cache(config["compile_cache"]),
@@ -338,11 +331,11 @@ def _text(config: Mapping[str, Any], key: str) -> str:
 
 def _name(config: Mapping[str, Any]) -> str:
     name = "" if config["name"] is None else str(config["name"])
-    if not SAFE_NAME.fullmatch(name) or ".." in name:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", name) or ".." in name:
         raise UserError(
             f"name={name[:200]!r} must be at most 100 letters, digits, '.', '_' and '-', since it names a folder"
         )
-    if name in RESERVED:
+    if name in ("claims", "references", "standard", "trace"):
         raise UserError(f"name={name} is reserved for a folder of results_dir that is not an experiment")
     return name
 

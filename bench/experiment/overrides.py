@@ -15,7 +15,6 @@ from bench.host.identity import split_items
 
 GLOBAL = "# @package _global_"
 """The first line of an experiment file, so that Hydra does not nest its settings."""
-RANGE = re.compile(r"range\(([^()]*)\)")
 TABLES = ("sweep", "marks", "compares", "reference")
 """Settings that are tables; the parameters of plugins are too."""
 LISTS_AS = "write key=value with lists as [a,b] and strings in quotes"
@@ -54,7 +53,7 @@ def with_ranges(key: str, value: str) -> str:
     """
     if key.partition(".")[0] not in ("sweep", "theta0") or "'" in value or '"' in value:
         return value
-    return RANGE.sub(lambda match: f"[{','.join(map(str, _range(key, match)))}]", value)
+    return re.sub(r"range\(([^()]*)\)", lambda match: f"[{','.join(map(str, _range(key, match)))}]", value)
 
 
 def _range(key: str, match: re.Match[str]) -> range:

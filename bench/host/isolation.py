@@ -14,8 +14,6 @@ from threadpoolctl import threadpool_limits
 
 X64 = "JAX_ENABLE_X64"
 """Environment variable with which JAX computes in float64 from its import on."""
-LIBRARIES = ("numpy", "scipy.special", "jax", "torch")
-"""The libraries whose threads are limited."""
 
 
 class ProcessState:

@@ -13,8 +13,6 @@ from bench.model import Problem
 
 PARTS = 64
 """Default number of intervals of each line at the first level."""
-SUSPECTS = 32
-"""Number of intervals refined at each level."""
 FINEST = 1e-11
 """Interval length, as a share of the line, at which a change of the cost that no longer shrinks is a jump."""
 LOUD = 100.0
@@ -209,7 +207,7 @@ def largest_jump(
     ``cost`` maps points ``(n, B)`` to ``(B,)``. As intervals of length h shrink, the second difference of a smooth cost
     falls as h^2, at a kink as h, and at a jump it is constant. Three kinds of jumps are missed: jumps below 1e-6 of the
     cost's range on the lines, jumps between two of the first ``parts`` + 1 nodes of a line that do not change the cost
-    at these nodes, and jumps in an interval whose second difference more than :data:`SUSPECTS` other intervals exceed.
+    at these nodes, and jumps in an interval whose second difference more than 32 other intervals exceed.
     Values that are not finite are ignored.
     """
     count = starts.shape[1]
@@ -247,8 +245,8 @@ def largest_jump(
             where = int(line[best]), float(nodes[best, at_jump : at_jump + 2].mean())
             change = float(isolated[best])
             break
-        row, place = np.unravel_index(np.argsort(bends, axis=None)[-SUSPECTS:], bends.shape)
-        # number of intervals into which a suspicious interval and its neighbour are divided at every further level
+        row, place = np.unravel_index(np.argsort(bends, axis=None)[-32:], bends.shape)
+        # the 32 most suspicious intervals and their neighbours are divided into as many at every further level
         line, left, width, parts = line[row], nodes[row, place], 2.0 * width / parts, 32
     if single:
         # steps of rounding are flat at the last level, so that they have no median bend

@@ -23,7 +23,6 @@ COLUMNS = 4096
 small. The pilot, which selects the estimator of a sampled reference, is one batch."""
 LEAST_SAMPLES = 16384
 """Minimum samples of a sampled reference, unless the limit is lower: a small spread of few samples proves nothing."""
-QUADRATURE_POINTS = 1 << 20
 TAIL_EVENTS = 10.0
 """Expected samples in the tails. Their contribution is estimated separately, as a spread may not show so few samples."""
 DEEPER = 0.2
@@ -95,7 +94,7 @@ def certify(
     samples: int,
     tolerance: float,
     physical: np.ndarray | None = None,
-    points: int = QUADRATURE_POINTS,
+    points: int = 1 << 20,
 ) -> Reference:
     """Return the reference gradient of a problem, by the best applicable method.
 

@@ -13,8 +13,6 @@ import numpy as np
 
 MIN_COLUMNS = 512
 """Minimum columns per thread for which another thread saves time; a problem may set its own minimum."""
-MAX_COLUMNS = 1 << 14
-"""Maximum columns per block: larger blocks save no time."""
 
 
 def cores() -> int:

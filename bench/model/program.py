@@ -98,10 +98,8 @@ class Program(ABC):
     @property
     def needs(self) -> frozenset[str]:
         """Capabilities that a backend must provide to run the program: ``root``, ``physics`` or neither."""
-        needs = {"root"} if self.needs_root else set()
-        if isinstance(self.scene, EngineScene):
-            needs.add("physics")
-        return frozenset(needs)
+        needs = {"root": self.needs_root, "physics": isinstance(self.scene, EngineScene)}
+        return frozenset(name for name, is_needed in needs.items() if is_needed)
 
     @property
     def continuous(self) -> bool:

@@ -68,9 +68,8 @@ def store_of(experiment: Experiment) -> Store:
 def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     """Run the missing cells of an experiment and merge their rows into ``rows.parquet``.
 
-    Cells whose rows are gone at the end, for example since the results folder was renamed or removed, are run again.
-    Raises :class:`Stopped` after a failed cell in an experiment with ``on_error=stop`` and if rows are missing
-    even so, KeyboardInterrupt if interrupted (every cell finished by then is stored), and :class:`UserError` if the study
+    Raises :class:`Stopped` after a failed cell in an experiment with ``on_error=stop``, and where rows are gone at the end, for
+    example since the results folder was renamed or removed, KeyboardInterrupt if interrupted (every cell finished by then is stored), and :class:`UserError` if the study
     supports no cell.
     """
     started = time.time()
@@ -84,21 +83,9 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     for folder in (experiment.directory, experiment.directory / "pending", experiment.results_dir / "references"):
         remove_stale(folder)
     _run(experiment, planned, store, quiet)
-    # cells whose rows are gone at the end of a run are run again, at most twice
-    for is_last in (False, False, True):
-        stored = set(store.load()["key"])
-        rest = [replace(item, stored=item.cell.key in stored) for item in planned]
-        if all(item.stored for item in rest):
-            break
-        missing = sum(not item.stored for item in rest)
-        if is_last:
-            raise Stopped(f"since {missing} cells were run and have no row")
-        print(
-            f"bench: {missing} of {len(planned)} cells were run and have no row in '{store.directory}': was it renamed or "
-            "removed? They are run again",
-            file=sys.stderr,
-        )
-        _run(experiment, rest, store, quiet)
+    stored = set(store.load()["key"])
+    if missing := len({item.cell.key for item in planned} - stored):
+        raise Stopped(f"since {missing} cells were run and have no row: was '{store.directory}' renamed or removed?")
     progress.print_others(experiment, planned, stored)
     return Finished(experiment, store, planned, time.time() - started)
 
@@ -154,8 +141,6 @@ class Runner:
     shown: progress.Progress
     read: dict[str, str] = field(default_factory=lambda: {reads.name_of(path): of for path, of in HASHED.items()})
     """Hashes of what code from outside has read in this run, by name."""
-    unchanged: set[str] = field(default_factory=lambda: {""})
-    """The texts in which answers give these hashes."""
 
     def run(self, planned: Sequence[Planned]) -> None:
         """Store a row for every cell that has none.
@@ -192,7 +177,7 @@ class Runner:
         if due:
             with launcher_of(self.experiment) as launcher:
                 answers = itertools.chain.from_iterable(
-                    self._answers([Task(start, descent=True) for start in due], launcher)
+                    self._answers([Task(start, "descent") for start in due], launcher)
                 )
                 for answer in answers:
                     key = answer.item.cell.descent_key
@@ -217,7 +202,7 @@ class Runner:
 
     def _compute_references(self, cells: list[Cell], references: list[Cell], launcher: Launcher) -> list[Cell]:
         """Compute references and return the cells to measure; cells whose reference failed are stored with its status."""
-        tasks = [Task(_for_reference(cell), reference=True) for cell in references]
+        tasks = [Task(_for_reference(cell), "reference") for cell in references]
         failed = {
             answer.item.cell.reference_key: result_of(answer, "its reference gradient: ")
             for answer in itertools.chain.from_iterable(self._answers(tasks, launcher))
@@ -238,26 +223,21 @@ class Runner:
         for answers in launcher.run(groups):
             guard.raise_pending_interrupt()
             n_done += len(answers)
-            current_answers = [*itertools.takewhile(lambda answer: not self._changed(answer), answers)]
-            if current_answers:
-                yield current_answers
-            if changed := next(filter(None, map(self._changed, answers[len(current_answers) :])), ""):
-                raise Stopped(f"since {changed} changed during the run")
+            good = [*itertools.takewhile(lambda answer: not self._changed(answer), answers)]
+            if good:
+                yield good
+            if len(good) < len(answers):
+                raise Stopped(f"since {self._changed(answers[len(good)])} changed during the run")
             current = "; ".join(str(item) for item in launcher.current)
-            if what := "references" * tasks[0].reference or "descents" * tasks[0].descent:
+            if what := tasks[0].kind:
                 # these are no cells, so the counts of cells stand still meanwhile
-                current += f" ({n_done} of {len(tasks)} {what} done)"
+                current += f" ({n_done} of {len(tasks)} {what}s done)"
             self.shown.working(current)
 
     def _changed(self, answer: TaskResult) -> str:
         """Return what had another content when the cells were planned or an earlier one ran; empty if there is nothing."""
-        if (text := answer.result.get("reads", "")) in self.unchanged:
-            return ""
-        for name, content in json.loads(text).items():
-            if self.read.setdefault(name, content) != content:
-                return str(name)
-        self.unchanged.add(text)
-        return ""
+        read = json.loads(answer.result.get("reads") or "{}")
+        return next((name for name, content in read.items() if self.read.setdefault(name, content) != content), "")
 
     def _finish(self, results: list[tuple[Cell, dict[str, Any]]]) -> None:
         """Store rows and report them; raises :class:`Stopped` if due."""

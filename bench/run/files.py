@@ -13,9 +13,6 @@ from pathlib import Path
 
 from bench.errors import StorageError
 
-TEMPORARY = re.compile(r"\..+-bench-[0-9a-f]{32}")
-"""Names of files being written."""
-
 
 def remove_stale(directory: Path) -> None:
     """Remove the half-written files of killed runs from a directory, but not from its subdirectories."""
@@ -23,7 +20,7 @@ def remove_stale(directory: Path) -> None:
         for path in directory.iterdir():
             with suppress(OSError):
                 # age in seconds after which a half-written file is that of a killed run
-                if TEMPORARY.fullmatch(path.name) and time.time() - path.stat().st_mtime > 3600.0:
+                if re.fullmatch(r"\..+-bench-[0-9a-f]{32}", path.name) and time.time() - path.stat().st_mtime > 3600.0:
                     path.unlink()
 
 

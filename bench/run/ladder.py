@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 WAITING = "waiting"
 """Status of a cell that waits for a rung below it."""
-UNCHECKED = ("unsupported", "unavailable", WAITING)
-"""Statuses of cells that were not run."""
 
 
 def climb(
@@ -66,7 +64,7 @@ def fault_of(study: Study, rows: pd.DataFrame) -> str:
 
     They pass if at least one cell was checked, no cell failed, and the study finds no :meth:`~Study.failure`.
     """
-    checked = rows[~rows["status"].isin(UNCHECKED)]
+    checked = rows[~rows["status"].isin(("unsupported", "unavailable", WAITING))]
     if checked.empty:
         return f"no cell could be checked ({', '.join(dict.fromkeys(map(printable, rows['reason'])))})"
     failed = checked[checked["status"] != "ok"]

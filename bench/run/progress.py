@@ -22,10 +22,8 @@ if TYPE_CHECKING:
     import rich.console
     import rich.progress
 
-FIRST_LINE_S, LINE_S = 5.0, 10.0
-"""Seconds before the first line and between lines where the output is not a terminal."""
-NAME_WIDTH, BAR_WIDTH = 20, 16
-"""Most characters of the experiment's name, and characters of a bar."""
+LINE_S = 10.0
+"""Seconds between lines where the output is not a terminal; the first comes after half of them."""
 
 
 class Progress:
@@ -40,7 +38,7 @@ class Progress:
         self._failed: Counter[str] = Counter()
         self._n_due = sum(item.runs for item in planned)  # stored and refused cells take no time
         self._task = bars.add_task(printable(name), total=self._n_due, counts=self._counts(), current="")
-        self._printed_at = time.monotonic() + FIRST_LINE_S - LINE_S
+        self._printed_at = time.monotonic() - LINE_S / 2
         if lines and self._n_done:
             print(f"{name}: {self._n_done} of {self._n_cells} cells are stored", file=sys.stderr)
 
@@ -77,10 +75,10 @@ def bars_on(console: rich.console.Console, disable: bool = False) -> rich.progre
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
     from rich.table import Column
 
-    name = Column(no_wrap=True, overflow="ellipsis", max_width=NAME_WIDTH)
+    name = Column(no_wrap=True, overflow="ellipsis", max_width=20)
     current = Column(no_wrap=True, overflow="ellipsis", ratio=1)
     return Progress(
-        TextColumn("{task.description}", markup=False, table_column=name), BarColumn(BAR_WIDTH),
+        TextColumn("{task.description}", markup=False, table_column=name), BarColumn(16),
         TextColumn("{task.fields[counts]}", markup=False), TimeRemainingColumn(compact=True),
         TextColumn("{task.fields[current]}", markup=False, table_column=current),
         console=console, transient=True, expand=True, disable=disable,

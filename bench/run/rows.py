@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 MAX_ROWS = 5_000_000
 """Largest number of rows of a file: five times the largest sweep."""
-MAX_BYTES, MAX_GROWTH, ALWAYS_BYTES = 1 << 33, 500, 1 << 28
-"""Largest size of a table in memory; also as a multiple of the file's size, above 256 MiB."""
+ALWAYS_BYTES = 1 << 28
+"""Size in memory that every table may have."""
 MAX_TEXT = 1_000_000
 """Length of the longest string, in characters."""
 COUNTS = {"samples": 1, "repeats": 1, "seed": 0, "horizon": 0}
@@ -70,7 +70,7 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFra
     groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
     n_values = sum(group.column(i).num_values for group in groups for i in range(group.num_columns))
     size = max(sum(group.total_byte_size for group in groups), 8 * n_values)  # equal values take no room in a file
-    most = min(MAX_BYTES, max(ALWAYS_BYTES, MAX_GROWTH * content.getbuffer().nbytes))
+    most = min(1 << 33, max(ALWAYS_BYTES, 500 * content.getbuffer().nbytes))
     if metadata.num_rows > MAX_ROWS or size > most:
         raise ValueError(f"{metadata.num_rows} rows and {size} bytes are more than a run writes")
     leaves = [metadata.schema.column(i) for i in range(metadata.num_columns)]
