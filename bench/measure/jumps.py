@@ -50,22 +50,13 @@ class Jump(NamedTuple):
     """Place of the jump on its line, from 0 at the start to 1 at the end."""
 
 
-class MissedSlope(NamedTuple):
-    """The part of the mean slope along a line through the noise that sampled gradients do not have."""
-
-    share: float
-    """The missed slope over the largest mean slope of all lines; 0 where gradients miss nothing that matters."""
-    w: np.ndarray
-    """The noise ``(n_w,)`` where most of it lies."""
-
-
 class Lost(NamedTuple):
-    """Samples of the noise at which a cost, or a gradient of a cost that is a number, is NaN or infinite."""
+    """What is lost of the mean of gradients: samples that are NaN or infinite, or a part of the mean slope along a line."""
 
     share: float
-    """Share of the samples; 0 without any."""
+    """Share of the samples, or of the largest mean slope of all lines; 0 where nothing is lost."""
     w: np.ndarray
-    """The noise ``(n_w,)`` of the sample nearest to theta; 0 without any."""
+    """The noise ``(n_w,)`` of the sample nearest to theta, or where most of the slope lies; 0 where nothing is lost."""
 
 
 class Sampled(NamedTuple):
@@ -107,7 +98,7 @@ def _costs_and_gradients(problem: Problem, theta: np.ndarray, w: np.ndarray, col
     return in_columns(both, w, columns)
 
 
-def missed_slope(problem: Problem, theta: np.ndarray, seed: int, columns: int) -> MissedSlope:
+def missed_slope(problem: Problem, theta: np.ndarray, seed: int, columns: int) -> Lost:
     """Return the slope of the mean cost at ``theta (d,)`` that sampled gradients miss, on lines through its noise.
 
     On a line, the derivative of the mean cost is E[f(t) t] for a standard normal t, from costs, and E[f'(t)] from
@@ -116,7 +107,7 @@ def missed_slope(problem: Problem, theta: np.ndarray, seed: int, columns: int) -
     chaos. Only noise that acts on theta has gradients along a line; the share is 0 for other noise.
     """
     width, dim = problem.program.n_noise, problem.dim
-    nothing = MissedSlope(0.0, np.zeros(width))
+    nothing = Lost(0.0, np.zeros(width))
     if not problem.noise_on_theta or not problem.sigma > 0.0:
         return nothing
     directions = _lines_of_slopes(dim, np.random.default_rng([seed, 0x736C6F70]))
@@ -147,7 +138,7 @@ def missed_slope(problem: Problem, theta: np.ndarray, seed: int, columns: int) -
     rest = np.where(np.abs(t[1:]) > MET, np.abs(np.diff(costs[line])), rest) * density[1:]
     w = np.zeros(width)
     w[:dim] = directions[:, line] * t[int(np.argmax(rest))]
-    return MissedSlope(float(shares[line]), w)
+    return Lost(float(shares[line]), w)
 
 
 def coordinates(width: int, most: int) -> np.ndarray:

@@ -429,10 +429,9 @@ def summarise(
     notes += _reference_remarks(reference, relative)
     if unbiased and bias[1] > 0.0:
         notes.append(f"declared unbiased, and its interval excludes 0: {UNEXPLAINED}, or chance (about 1 row in 30)")
-    per_sample = _ends("variance_per_sample", [value * samples * unit * unit for value in variance])
+    per_sample = [value * samples * unit * unit for value in variance]
     if terms is not None:
-        value, low, high = variance_per_sample(*terms, samples)
-        per_sample = _ends("variance_per_sample", (value, low, high))
+        _, low, high = per_sample = variance_per_sample(*terms, samples)
         # width of the interval of the log variance of terms, times their number, below which it ignores the
         # error of their mean
         if low > 0.0 and math.log(high / low) < 10.0 / (repeats * samples):
@@ -441,10 +440,10 @@ def summarise(
         grad_norm=float(np.linalg.norm(mean)) * unit,
         reference_norm=norm * unit,
         reference_se=reference.standard_error * unit,
-        **_ends("bias", [value * unit for value in bias]),
+        **ends("bias", [value * unit for value in bias]),
         bias_rel=bias[0] / relative,
-        **_ends("variance", [value * unit * unit for value in variance]),
-        **per_sample,
+        **ends("variance", [value * unit * unit for value in variance]),
+        **ends("variance_per_sample", per_sample),
         rmse=error * unit,
         rmse_rel=error / relative,
         cosine=cosine,
@@ -465,8 +464,8 @@ def _check_shapes(estimates: np.ndarray, truth: Truth, samples: int) -> None:
         raise ValueError(f"an estimate is made of one sample or more; given {samples}")
 
 
-def _ends(name: str, values: Iterable[float]) -> dict[str, Any]:
-    """Return the fields of a number and of the ends of its interval."""
+def ends(name: str, values: Iterable[float]) -> dict[str, Any]:
+    """Return a number and the ends of its interval by name, ``<name>_low`` and ``<name>_high``."""
     return dict(zip((name, f"{name}_low", f"{name}_high"), values, strict=True))
 
 

@@ -16,6 +16,7 @@ from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule, bo
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Table, Views
+from bench.measure.statistics import ends
 from bench.model import Rollout, columns, param
 
 from . import PARTS, StudyPackage, all_noise, finite_status, mean_interval, norm
@@ -245,8 +246,7 @@ def fit(horizons: np.ndarray, norms: np.ndarray, errors: np.ndarray, bounded: bo
         verdict = "vanishing"
     elif order[1] > 0 and (odds <= 1 / STRONG or (odds <= 1 and bounded)):
         verdict = "polynomial"
-    names = (f"{name}{end}" for name in ("order", "rate") for end in ("", "_low", "_high"))
-    return {"verdict": verdict, "odds": odds, **dict(zip(names, (*order, *rate), strict=True))}
+    return {"verdict": verdict, "odds": odds, **ends("order", order), **ends("rate", rate)}
 
 
 def _slope(places: np.ndarray, logarithms: np.ndarray, errors: np.ndarray) -> tuple[float, ...]:

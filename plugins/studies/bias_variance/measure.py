@@ -18,6 +18,7 @@ import numpy as np
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import noise, timing
+from bench.measure.statistics import ends
 from bench.measure.timing import Pause
 from bench.model import IID, Auxiliaries, Problem, SampleMean, columns, per_repeat
 from bench.model.estimator import require_shape
@@ -200,8 +201,7 @@ def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]
 def costs_of(problem: Problem, w: np.ndarray) -> dict[str, float]:
     """Return the columns of the costs at theta with noise ``w (n_w, b)``: mean, and the range of 95% of them."""
     costs = problem.value(problem.program.theta0, w)
-    low, high = np.quantile(costs, (0.025, 0.975))
-    return {"cost": float(costs.mean()), "cost_low": float(low), "cost_high": float(high)}
+    return ends("cost", map(float, (costs.mean(), *np.quantile(costs, (0.025, 0.975)))))
 
 
 def summarise_diagnostics(diagnostics: list[Auxiliaries]) -> str:
