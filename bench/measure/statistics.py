@@ -464,8 +464,8 @@ def _check_shapes(estimates: np.ndarray, truth: Truth, samples: int) -> None:
         raise ValueError(f"an estimate is made of one sample or more; given {samples}")
 
 
-def ends(name: str, values: Iterable[float]) -> dict[str, Any]:
-    """Return a number and the ends of its interval by name, ``<name>_low`` and ``<name>_high``."""
+def ends(name: str, values: Iterable[Any]) -> dict[str, Any]:
+    """Return a number, or a list, and the ends of its interval by name, ``<name>_low`` and ``<name>_high``."""
     return dict(zip((name, f"{name}_low", f"{name}_high"), values, strict=True))
 
 

@@ -485,10 +485,6 @@ class _VaryingOps(Ops):
         super().__init__(ops.xp)
         self._ops, self._places = ops, places
 
-    def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """Return the last carry of the backend's ``scan``."""
-        return self._ops.scan(step, carry, xs, length)
-
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
         """Return the backend's ``root``, with the parameter values passed as additional arguments."""
         whole = [getattr(plugin, name) for plugin, name in self._places]

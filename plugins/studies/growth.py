@@ -123,9 +123,8 @@ class Growth(StudyPackage):
             terms = np.where(good, terms, math.nan).reshape(len(theta), cell.repeats, cell.samples)
             with np.errstate(over="ignore"):
                 totals = np.nansum(np.nanvar(terms, axis=2, ddof=1), axis=0)
-            found = (np.median(totals), *np.quantile(totals, [QUANTILES["low"], QUANTILES["high"]]), totals.mean())
-            ends = zip(("", "_low", "_high", "_mean"), map(float, found), strict=True)
-            result |= {f"{order}_variance{end}": value for end, value in ends}
+            found = np.median(totals), *np.quantile(totals, [QUANTILES["low"], QUANTILES["high"]])
+            result |= ends(f"{order}_variance", map(float, found)) | {f"{order}_variance_mean": float(totals.mean())}
         steps = problem.jacobians(theta, w[:, good][:, : self.rollouts]).a
         singular, spectral = products(steps)
         rates = {"stretch": rate(singular[:, 0], len(steps)), "spectral": rate(spectral, len(steps))}
