@@ -411,7 +411,6 @@ def _gradcheck(words: list[str]) -> int:
     """Run ``gradient_check`` on the scenes named first. Returns 1 if a cell has an error or a gradient is wrong."""
     from dataclasses import replace
 
-    from bench.experiment.study import study_of
     from bench.host.parameters import parameters
     from bench.report.finish import finish
 
@@ -434,8 +433,8 @@ def _gradcheck(words: list[str]) -> int:
     finished = _execute(experiment, words)
     if isinstance(finished, int):
         return finished
-    rows, *shown = finish(finished, ["gradcheck", *words])
-    return int(_show(experiment, rows, *shown) or study_of(experiment).faults(rows) > 0)
+    rows, views, paths = finish(finished, ["gradcheck", *words])
+    return int(_show(experiment, rows, views, paths) or experiment.study.faults(rows) > 0)
 
 
 def _with_engine(words: list[str], settings: list[str]) -> Experiment:

@@ -54,7 +54,8 @@ class Cell:
     samples: int
     repeats: int
     seed: int
-    study: Plugin
+    study: Any
+    """The :class:`bench.experiment.study.Study` that measures it; its module imports this one."""
     decision: Decision = OWN
     timing: bool = True
     """Whether the row records timings."""
@@ -248,8 +249,7 @@ class Cell:
 
     def program(self) -> Program:
         """Compose the program; raises :class:`Unsupported` if the parts do not fit together."""
-        study = cast(Any, self.study)  # a Study, whose module imports this one
-        decision = study.decision(self.decision)
+        decision = self.study.decision(self.decision)
         if self.point is not None:
             decision = Decision(decision.names, self.point.theta)
         return compose(self.scene, self.contact, self.integrator, decision)
@@ -294,7 +294,7 @@ class Cell:
             if name in self.swept:
                 return "unsupported", f"{idle(name, self.scene, self.contact)}, so its values are no axis"
         if self.path is not None:
-            if not cast(Any, self.study).descends:
+            if not self.study.descends:
                 return "unsupported", f"study {self.study.name} starts where its own settings say: descent=0"
             if start is not None and (reason := self.path.descent_backend.refusal(start)):
                 return "unsupported", f"its descent: {reason}"

@@ -293,7 +293,6 @@ def from_settings(config: Mapping[str, Any]) -> Experiment:
     return Experiment(
         name=_name(config),
         study=study,
-        columns=study.columns,
         timing=study.timed if timing is None else coerce(bool, timing, "timing"),
         execution=_execution(config),
         choices=choices,

@@ -67,10 +67,8 @@ class Experiment:
     """A named sweep: plugins, parameters, sample counts, and the study that measures each cell."""
 
     name: str
-    study: Plugin
-    """The :class:`bench.experiment.study.Study` that measures each cell."""
-    columns: Columns
-    """The columns of its rows, as the study declares them."""
+    study: Any
+    """The :class:`bench.experiment.study.Study` that measures it; its module imports this one."""
     choices: Mapping[str, Sequence[Choice]]
     """The chosen plugins by axis (``scene``, ...), in the order of the study's axes."""
     values: Mapping[str, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
@@ -107,6 +105,11 @@ class Experiment:
     timing: bool = False
     """Whether cells are timed, and therefore run one at a time on a machine."""
     execution: Execution = Execution()
+
+    @property
+    def columns(self) -> Columns:
+        """The columns of its rows, as the study declares them."""
+        return self.study.columns
 
     @property
     def directory(self) -> Path:

@@ -13,7 +13,6 @@ from bench.errors import Unsupported, UserError, unknown
 from bench.experiment.cell import DESCENDED, Cell
 from bench.experiment.experiment import Choice, Experiment
 from bench.experiment.parameters import DESCENT, PROBLEM, THETA, applies
-from bench.experiment.study import study_of
 from bench.host.parameters import build, coerce, parameters, singular
 from bench.model import ContactLaw, Decision, MechanicalScene, Plugin, compose
 from bench.model.program import OWN
@@ -211,15 +210,14 @@ def _cell(experiment: Experiment, point: Mapping[str, Any], choices: Mapping[str
     decision = start = _decision(experiment, point, parts)
     if share := share_of(point.get(DESCENT, experiment.descent)):
         decision = dataclasses.replace(start, descent=share)
-    study = study_of(experiment)
-    parts = study.parts(parts)
+    parts = experiment.study.parts(parts)
     return Cell(
         parts,
         **_counts(experiment, point),
-        study=study,
+        study=experiment.study,
         decision=decision,
         timing=experiment.timing,
-        budget=experiment.reference if study.compares(parts) else None,
+        budget=experiment.reference if experiment.study.compares(parts) else None,
         path=_path(experiment, parts["scene"], start) if share else None,
         swept=tuple(parameter_name(axis) for axis in used if parts["scene"] and used[axis] == parts["scene"].name),
     )
@@ -248,8 +246,8 @@ def _decision(experiment: Experiment, point: Mapping[str, Any], parts: Mapping[s
             raise UserError(f"the sweep gives theta0 and {', '.join(given.keys() - {THETA})}: give one of them")
         return dataclasses.replace(decision, at=given[THETA])
     try:
-        program = (parts.get(axis) for axis in PROBLEM)
-        at = compose(*program, decision=study_of(experiment).decision(decision)).theta0.tolist()  # type: ignore[arg-type]
+        program: list[Any] = [*map(parts.get, PROBLEM), experiment.study.decision(decision)]
+        at = compose(*program).theta0.tolist()
     except (Unsupported, UserError):  # the cell reports the error in its row
         return decision
     for name, values in given.items():
@@ -289,7 +287,7 @@ def _plugin(
             )
         used[name] = plugin.name
     # later values replace earlier ones: the scene's contact values, settings, identity string, sweep
-    values = _of_scene(scene, plugin) | experiment.values.get(axis, {}).get(plugin.name, {})
+    values = dict(_of_scene(scene, plugin), **experiment.values.get(axis, {}).get(plugin.name, {}))
     values |= dict(choice.values) | {parameter: point[name] for name, parameter in axes}
     return _build(plugin, sorted(values.items()))
 

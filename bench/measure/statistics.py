@@ -429,7 +429,7 @@ def summarise(
     notes += _reference_remarks(reference, relative)
     if unbiased and bias[1] > 0.0:
         notes.append(f"declared unbiased, and its interval excludes 0: {UNEXPLAINED}, or chance (about 1 row in 30)")
-    per_sample = [value * samples * unit * unit for value in variance]
+    per_sample = tuple(value * samples * unit * unit for value in variance)
     if terms is not None:
         _, low, high = per_sample = variance_per_sample(*terms, samples)
         # width of the interval of the log variance of terms, times their number, below which it ignores the

@@ -19,7 +19,6 @@ from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
 from bench.experiment.keys import HASHED
 from bench.experiment.parameters import completed_rows
-from bench.experiment.study import study_of
 from bench.host import guard, reads
 from bench.measure import timing
 from bench.measure.descent import DescentPath
@@ -68,9 +67,9 @@ def store_of(experiment: Experiment) -> Store:
 def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     """Run the missing cells of an experiment and merge their rows into ``rows.parquet``.
 
-    Raises :class:`Stopped` after a failed cell in an experiment with ``on_error=stop``, and where rows are gone at the end, for
-    example since the results folder was renamed or removed, KeyboardInterrupt if interrupted (every cell finished by then is stored), and :class:`UserError` if the study
-    supports no cell.
+    Raises :class:`Stopped` after a failed cell in an experiment with ``on_error=stop``, and where rows are gone at the end
+    since the results folder was renamed or removed, KeyboardInterrupt if interrupted (every cell finished by then is stored),
+    and :class:`UserError` if the study supports no cell.
     """
     started = time.time()
     # measured before the run itself loads the machine
@@ -106,9 +105,8 @@ def _refuse_without_supported_cells(experiment: Experiment, planned: Sequence[Pl
     """Raise :class:`UserError` with the reasons if the study supports no cell of the experiment."""
     if any(item.refusal is None for item in planned):
         return
-    study = study_of(experiment)
     try:
-        reasons = dict.fromkeys(study.refusal(item.cell) for item in planned)
+        reasons = dict.fromkeys(experiment.study.refusal(item.cell) for item in planned)
     except (Unsupported, UserError):
         return  # a cell without a program reports the reason in its row
     if reasons and None not in reasons:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from bench.errors import printable
 from bench.experiment.experiment import Experiment
-from bench.experiment.study import Study, study_of
+from bench.experiment.study import Study
 from bench.run.plan import Planned
 from bench.run.store import Store
 
@@ -44,7 +44,7 @@ def climb(
         for backend, part in rows.groupby("backend", sort=False):
             if backend in stops:
                 continue
-            fault = fault_of(study_of(experiment), part)
+            fault = fault_of(experiment.study, part)
             if fault:
                 stops[str(backend)] = f"the rung below ({name}) did not pass: {fault}"
             verdict = f"did not pass: {fault}" if fault else "passed"

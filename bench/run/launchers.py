@@ -14,7 +14,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from bench.experiment.experiment import Experiment
-from bench.experiment.study import study_of
 from bench.run.pool import BATCH_S, Pool, TaskResult
 from bench.run.tasks import FAILED, Task, TaskHandler
 
@@ -73,5 +72,5 @@ def launcher_of(experiment: Experiment, timed: bool = False) -> Launcher:
         return InProcessLauncher(TaskHandler(experiment, single_thread=not timed))
     return Pool(
         1 if timed else workers, TaskHandler, replace(experiment, choices={}, values={}, sweep={}, also=(), marks={}), rules,
-        single_thread=not timed or study_of(experiment).fresh_process, folders=experiment.plugins, outside=lambda task: task.outside,
+        single_thread=not timed or experiment.study.fresh_process, folders=experiment.plugins, outside=lambda task: task.outside,
     )  # fmt: skip

@@ -13,7 +13,6 @@ from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
 from bench.experiment.grid import COUNTS, cells
 from bench.experiment.parameters import completed_json
-from bench.experiment.study import study_of
 from bench.host import guard, reads
 from bench.host.parameters import remember
 from bench.model import Backend, Plugin, registry
@@ -70,7 +69,7 @@ def _is_in_shard(cell: Cell, shard: tuple[int, int] | None) -> bool:
 
 def _planned(experiment: Experiment, cell: Cell, stored: dict[str, tuple[str, ...]], present: reads.Present) -> Planned:
     refusal = cell.refusal()
-    if refusal is None and (reason := study_of(experiment).refusal(cell)) is not None:
+    if refusal is None and (reason := experiment.study.refusal(cell)) is not None:
         refusal = ("unsupported", reason)
     if cell.key not in stored:
         return Planned(cell, False, refusal)

@@ -16,7 +16,7 @@ from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
 from bench.experiment.keys import fingerprint, names_files
 from bench.experiment.parameters import PROBLEM
-from bench.experiment.study import Study, study_of
+from bench.experiment.study import Study
 from bench.host import guard, isolation, reads
 from bench.measure import descent, noise
 from bench.measure.statistics import PHYSICS
@@ -73,7 +73,7 @@ class TaskHandler:
 
     def __init__(self, experiment: Experiment, single_thread: bool = False) -> None:
         self._session = RunSession(experiment)
-        self._study = study_of(experiment)
+        self._study = experiment.study
         self._state = isolation.ProcessState(single_thread)
         RAN.update(registry.IMPORTED)
         self.is_tainted = False
