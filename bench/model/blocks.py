@@ -45,7 +45,8 @@ def _n_listed(ranges: str) -> int:
 def columns_in_cache(column_bytes: int) -> int:
     """Return the number of columns that fill half of a core's cache, within limits."""
     columns = cache_bytes() // 2 // max(column_bytes, 1)
-    return min(max(columns, MIN_COLUMNS), MAX_COLUMNS)
+    # larger blocks save no time
+    return min(max(columns, MIN_COLUMNS), 1 << 14)
 
 
 def n_threads(count: int, threads: int, least: int) -> int:
