@@ -11,17 +11,8 @@ import time
 from bench.errors import describe_exit
 from bench.run.reaper import MARK, Reaper
 
-INTERNAL = 70
-"""The status of a command that failed by an error of this package."""
-NO_VERDICT = 3
-"""The status of a command whose process ended without one."""
 CHANNEL = "BENCH_CHANNEL"
 """Environment variable of a command's process: the descriptor to which it writes its status, and its parent's id."""
-FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-AGAIN_S = 0.5
-"""Seconds after which a further signal ends a command immediately: a terminal and a parent may send the same one."""
-POLL_S, EXIT_S = 0.2, 1.0
-"""Seconds between checks of the command's process, and seconds in which it ends after it has written its status."""
 
 
 def command() -> None:
@@ -50,7 +41,7 @@ def command() -> None:
     except Exception as error:  # a bug of this package, unless code from outside has changed the process
         outside = f"; imported from outside: {', '.join(sorted(registry.IMPORTED))}" if registry.IMPORTED else ""
         print(f"bench: internal error: {failure(error)['reason']}{outside}", file=sys.stderr)
-        status = INTERNAL
+        status = 70
     guard.exit_if_forked(pid)
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(Exception):  # a plugin may have closed or replaced it
@@ -71,15 +62,16 @@ def _watched() -> int:
     def forward(number: int, _: object) -> None:
         nonlocal first
         first = first or time.monotonic()
-        child.send_signal(number if time.monotonic() < first + AGAIN_S else signal.SIGKILL)
+        # a further signal ends a command immediately, but a terminal and a parent may send the same one
+        child.send_signal(number if time.monotonic() < first + 0.5 else signal.SIGKILL)
 
-    for number in FORWARDED:
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
             signal.signal(number, forward)
-    while child.poll() is None and not select.select([reader], [], [], POLL_S)[0]:
+    while child.poll() is None and not select.select([reader], [], [], 0.2)[0]:
         pass
     with contextlib.suppress(subprocess.TimeoutExpired):
-        child.wait(EXIT_S)
+        child.wait(1.0)  # it has written its status
     reaper.close()
     code = child.wait()
     if select.select([reader], [], [], 0)[0]:
@@ -87,7 +79,7 @@ def _watched() -> int:
     if first:
         return 128 + signal.SIGINT
     print(f"bench: the process ended before a verdict: {describe_exit(code)}", file=sys.stderr)
-    return NO_VERDICT
+    return 3
 
 
 if __name__ == "__main__":

@@ -222,13 +222,14 @@ def _load(words: Sequence[str]) -> Experiment:
 
 
 def _run(words: list[str]) -> int:
+    from bench.report.finish import finish
     from bench.run.progress import empty_shard
 
     finished = _execute(_load(words), words)
     if isinstance(finished, int):
         return finished
     if finished.experiment.execution.shard is None:
-        return _finish(finished, words)[0]
+        return _show(finished.experiment, *finish(finished, words))
     if not finished.planned:
         print(empty_shard(finished.experiment))
         return 0
@@ -260,14 +261,6 @@ def _execute(experiment: Experiment, words: Sequence[str]) -> Finished | int:
         return 130 if is_interrupt else 1
 
 
-def _finish(finished: Finished, words: Sequence[str]) -> tuple[int, pd.DataFrame]:
-    """Write and show all files of a finished run. Returns the exit status and the rows."""
-    from bench.report.finish import finish
-
-    rows, views, paths = finish(finished, words)
-    return _show(finished.experiment, rows, views, paths), rows
-
-
 def _show(experiment: Experiment, rows: pd.DataFrame, views: Views, paths: Sequence[Path]) -> int:
     from bench.report import writer
 
@@ -277,7 +270,7 @@ def _show(experiment: Experiment, rows: pd.DataFrame, views: Views, paths: Seque
 
 
 def _status(rows: pd.DataFrame) -> int:
-    return 1 if (rows["status"] == "error").any() else 0
+    return int((rows["status"] == "error").any())
 
 
 def _print_written(paths: Sequence[Path]) -> None:
@@ -414,17 +407,12 @@ def _split_scenes(words: Sequence[str], verb: str) -> tuple[list[str], list[str]
     return ([f"scenes=[{','.join(scenes)}]"] if scenes else []), settings
 
 
-def _sets_horizon(word: str) -> bool:
-    """Return whether a word of the command line sets a scene's horizon, as a setting or in an identity string."""
-    return re.match(r"scene\.\w+\.horizon=|[^=]*\[(.*,)?horizon=|\+?scenes=.*[\[,]horizon=", word) is not None
-
-
 def _gradcheck(words: list[str]) -> int:
     """Run ``gradient_check`` on the scenes named first. Returns 1 if a cell has an error or a gradient is wrong."""
     from dataclasses import replace
 
-    from bench.experiment.study import study_of
     from bench.host.parameters import parameters
+    from bench.report.finish import finish
 
     scenes, settings = _split_scenes(words, "gradcheck")
     _refer("gradcheck", words[: len(words) - len(settings)])
@@ -435,7 +423,9 @@ def _gradcheck(words: list[str]) -> int:
     }
     if not _is_given("sweep.horizon", settings):
         sweep = dict(experiment.sweep)
-        if own and not any(map(_sets_horizon, words)):
+        # as a setting, or in an identity string
+        is_set = re.compile(r"scene\.\w+\.horizon=|[^=]*\[(.*,)?horizon=|\+?scenes=.*[\[,]horizon=").match
+        if own and not any(map(is_set, words)):
             sweep["horizon"] = sorted({*sweep["horizon"], *own})
         else:
             sweep.pop("horizon", None)
@@ -443,21 +433,18 @@ def _gradcheck(words: list[str]) -> int:
     finished = _execute(experiment, words)
     if isinstance(finished, int):
         return finished
-    status, rows = _finish(finished, ["gradcheck", *words])
-    return 1 if status or study_of(experiment).faults(rows) else 0
-
-
-IN_ENGINES = ("backends=[mujoco]", "contacts=[penalty]")
-"""What ``gradcheck`` and ``trace`` take for scenes that only engines run, unless it is given."""
+    rows, views, paths = finish(finished, ["gradcheck", *words])
+    return int(_show(experiment, rows, views, paths) or experiment.study.faults(rows) > 0)
 
 
 def _with_engine(words: list[str], settings: list[str]) -> Experiment:
-    """Return the experiment of words and settings, with :data:`IN_ENGINES` where only engines run its scenes."""
+    """Return the experiment of words and settings, with a backend and law for scenes that only engines run."""
     from bench.model import EngineScene
 
     experiment = _load([*words, *settings])
     plugins = [choice.entry.plugin for choice in experiment.choices["scene"]]
-    in_engines = [word for word in IN_ENGINES if not _is_given(word.partition("=")[0], settings)]
+    words_of_engines = ("backends=[mujoco]", "contacts=[penalty]")
+    in_engines = [word for word in words_of_engines if not _is_given(word.partition("=")[0], settings)]
     if in_engines and all(plugin and issubclass(plugin, EngineScene) for plugin in plugins):
         print(f"bench: only engines run these scenes: {' '.join(in_engines)}", file=sys.stderr)
         return _load([*words, *in_engines, *settings])

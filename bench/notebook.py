@@ -37,11 +37,6 @@ class Estimates:
     auxiliaries: Mapping[str, np.ndarray]
     """Diagnostics of the estimator by name, such as a weight, each ``(R,)`` or ``(R, d)``."""
 
-    def _title(self) -> str:
-        return printable(
-            f"{self.estimator} on {self.problem.title}: {len(self.values)} estimates of {self.samples} samples"
-        )
-
     def _facts(self) -> dict[str, str]:
         """Return the statistics as text, relative to the norm of the reference unless that may be 0."""
         from bench.report.text import number
@@ -66,7 +61,8 @@ class Estimates:
         return {name: printable(fact) for name, fact in facts.items() if fact}
 
     def __str__(self) -> str:
-        return f"{self._title()}\n" + "; ".join(f"{name} {fact}" for name, fact in self._facts().items())
+        title = f"{self.estimator} on {self.problem.title}: {len(self.values)} estimates of {self.samples} samples"
+        return f"{printable(title)}\n" + "; ".join(f"{name} {fact}" for name, fact in self._facts().items())
 
     __repr__ = __str__
 

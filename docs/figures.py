@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from bench.plugins.studies import SPREAD
 from bench.plugins.studies.bias_variance import trust
 from bench.plugins.studies.gradient_check import is_trusted
 
@@ -48,13 +47,8 @@ def span(values: Any, digits: int = 2, suffix: str = "") -> str:
 
 @cache
 def trusted(*estimators: str) -> dict[str, str]:
-    """Return the counts of the rule on the spread: cells, trusted cells and the wrong ones among them, other cells and the right
-    ones among them.
-    """
-    rows = trust.cells(STANDARD, estimators)
-    keep, wrong = trust.spread(rows) < SPREAD, rows["rmse_rel"] >= trust.WRONG
-    counts = dict(cells=keep | ~keep, trusted=keep, wrong=keep & wrong, others=~keep, missed=~keep & ~wrong)
-    return {name: f"{keep.sum():,}" for name, keep in counts.items()}
+    """Return the counts of the rule on the spread, see :func:`trust.counts`."""
+    return {name: f"{count:,}" for name, count in trust.counts(trust.cells(STANDARD, estimators)).items()}
 
 
 def trust_figure(name: str, *estimators: str) -> Callable[[], str]:

@@ -213,7 +213,6 @@ def experiment(
     return Experiment(
         name=name,
         study=BiasVariance(),
-        columns=COLUMNS,
         choices={},
         sweep={"sigma": [0.1, 0.3], "stiffness": list(STIFFNESS)} if sweep is None else sweep,
         results_dir=directory,

@@ -54,10 +54,6 @@ from bench.model import (
 )
 from bench.model.backend import CAPABILITIES
 
-COMPUTED = frozenset({"value", "grad", "score"})
-"""Capabilities that return a number per column."""
-REORDERED = {"float64": SAME, "float32": 1e-3}
-"""Relative difference allowed between rollouts with the same operations in another order, by the same."""
 FAR = 1e200
 """Size of a theta whose square overflows."""
 PRESSED = 1e-3
@@ -106,7 +102,8 @@ def value_agrees(backend: Backend) -> str:
         theta, w = samples(program)
         value = backend.compile(program).value(theta, w)
         require(value.shape == (COLUMNS,), f"{describe(program)}: shape {value.shape}, not {(COLUMNS,)}")
-        allowed = _allowed(backend, program, REORDERED[_dtype(backend)])
+        # rollouts may have the same operations in another order
+        allowed = _allowed(backend, program, {"float64": SAME, "float32": 1e-3}[_dtype(backend)])
         what = f"{describe(program)}: costs differ by more than {allowed:g}"
         offs.append(agree(value, plain.compile(program).value(theta, w), allowed, what))
     return f"to {max(offs):.0e} on {len(programs)} programs"
@@ -250,7 +247,7 @@ def columns_are_independent(backend: Backend) -> str:
     """
     worst, runs = 0.0, list(compiled(backend))
     for program, problem, theta, w in runs:
-        for capability in sorted(backend.provides & COMPUTED):
+        for capability in sorted(backend.provides & {"value", "grad", "score"}):
             function, rest = getattr(problem, capability), np.arange(COLUMNS) != 2
             whole, other = function(theta, w), function(*with_changed_column(theta, w))
             is_shaped = whole.shape == ((COLUMNS,) if capability == "value" else theta.shape)

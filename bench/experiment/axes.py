@@ -107,8 +107,8 @@ def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
             if not is_known.any():
                 continue
             if not clash and column in rows and column not in COUNTS:
-                is_number = pd.api.types.is_numeric_dtype(rows[column])
-                if not is_number or not np.array_equal(rows.loc[is_known, column].to_numpy(float), values[is_known]):
+                stored = pd.to_numeric(rows.loc[is_known, column], errors="coerce")
+                if not np.array_equal(stored.to_numpy(float), values[is_known]):
                     axis = replace(axis, column=part[0] if "." in part[0] else f"swept.{own_name}")
             result.append(axis)
     together = [*_zipped_names(sweep), *([frozenset(coordinates)] if len(coordinates) > 1 else [])]

@@ -54,7 +54,8 @@ class Cell:
     samples: int
     repeats: int
     seed: int
-    study: Plugin
+    study: Any
+    """The :class:`bench.experiment.study.Study` that measures it; its module imports this one."""
     decision: Decision = OWN
     timing: bool = True
     """Whether the row records timings."""
@@ -135,12 +136,6 @@ class Cell:
             raise Unsupported(f"no installed backend computes a descent of scene {self.scene.name}")
         return ranked[0]
 
-    @property
-    def _path_key(self) -> str:
-        with suppress(Unsupported):  # the cell is refused
-            return "" if self.path is None else self.path.descent_key
-        return "none"
-
     @cached_property
     def reference_key(self) -> str:
         """Hash of everything that decides the reference gradient; raises ValueError if the study computes none."""
@@ -158,7 +153,7 @@ class Cell:
                 radius = [] if smoothing is None else [[smoothing.shape, smoothing.radius]]
                 if smoothing is None:
                     methods = reference.revisions(self.program(), self.reference_backends[0].provides)
-            budget = list(counted(self.budget).values()) if self.budget else []
+            budget = list(counted(self.budget).values())
             _reference_keys[given] = hashed(self.program_key, budget, backend, *radius, raised(methods))
         return _reference_keys[given]
 
@@ -206,7 +201,9 @@ class Cell:
         theta = self._theta()
         if theta is None or self.path is None:
             return theta and {name: theta[name] for name in ("names", "at")}
-        return theta | {"path": self._path_key}
+        with suppress(Unsupported):
+            return theta | {"path": self.path.descent_key}
+        return theta | {"path": "none"}  # the cell is refused
 
     def columns(self) -> dict[str, Any]:
         """Return the identity columns of the cell's row: views of its parameters and counts."""
@@ -252,8 +249,7 @@ class Cell:
 
     def program(self) -> Program:
         """Compose the program; raises :class:`Unsupported` if the parts do not fit together."""
-        study = cast(Any, self.study)  # a Study, whose module imports this one
-        decision = study.decision(self.decision)
+        decision = self.study.decision(self.decision)
         if self.point is not None:
             decision = Decision(decision.names, self.point.theta)
         return compose(self.scene, self.contact, self.integrator, decision)
@@ -298,7 +294,7 @@ class Cell:
             if name in self.swept:
                 return "unsupported", f"{idle(name, self.scene, self.contact)}, so its values are no axis"
         if self.path is not None:
-            if not cast(Any, self.study).descends:
+            if not self.study.descends:
                 return "unsupported", f"study {self.study.name} starts where its own settings say: descent=0"
             if start is not None and (reason := self.path.descent_backend.refusal(start)):
                 return "unsupported", f"its descent: {reason}"

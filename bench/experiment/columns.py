@@ -261,11 +261,6 @@ class Columns:
         rules = [column.comparison for column in self.compared if column.comparison is not None]
         return frozenset(name for rule in rules for name in (rule.mean, rule.reference) if name)
 
-    @property
-    def referenced(self) -> bool:
-        """Whether rows are measured against a reference gradient."""
-        return "reference_method" in self.by_name
-
     def of_kind(self, kind: Kind) -> list[str]:
         """Return the names of the columns of one kind: ``number``, ``text`` or ``list``."""
         return [column.name for column in self.all if column.kind == kind]

@@ -7,6 +7,7 @@ import math
 import os
 import re
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import replace
 from functools import lru_cache
@@ -33,12 +34,7 @@ from bench.host import guard
 from bench.host.identity import parse_identity
 from bench.host.parameters import Parameter, build, check, coerce, parameters, remember, singular
 from bench.model import Decision, MechanicalScene, Plugin, registry
-
-SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
-RESERVED = ("claims", "references", "standard", "trace")
-"""Names of folders under ``results_dir`` that are not experiments."""
-SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
-BYTES = {"k": 2.0**10, "m": 2.0**20, "g": 2.0**30}
+from bench.simulator.clock import parse_duration
 
 
 def config_dir() -> Path:
@@ -152,7 +148,8 @@ def _composed_files(name: str, config_dirs: tuple[Path, ...], stamps: object) ->
 
     words, own = [], {}
     if name:
-        words, own = [f"+experiment={name}"], check_file(_file_of(name, config_dirs))
+        files = (folder / "experiment" / f"{name}.yaml" for folder in (*config_dirs, config_dir()))
+        words, own = [f"+experiment={name}"], check_file(next(file for file in files if file.exists()))
     if config_dirs:
         search_path = ",".join(f"'file://{folder.expanduser().absolute()}'" for folder in config_dirs)
         words.insert(0, f"hydra.searchpath=[{search_path}]")
@@ -184,12 +181,6 @@ def _joined(
         if other.study != main.study:
             raise UserError(f"also: {name} has another study or other settings of it than {main.name}")
     return replace(main, also=also)
-
-
-def _file_of(name: str, config_dirs: Sequence[Path]) -> Path:
-    """Return the file of an experiment, of the user's or of this package."""
-    folders = [folder / "experiment" for folder in (*config_dirs, config_dir())]
-    return next(path for folder in folders if (path := folder / f"{name}.yaml").exists())
 
 
 def _known_keys() -> frozenset[str]:
@@ -280,9 +271,6 @@ def _in_use(plugins: Sequence[type[Plugin]]) -> list[type[Plugin]]:
     return [plugin for plugin in plugins if plugin.kind not in unused]
 
 
-FORMATS = ("png", "svg", "pdf")
-
-
 def from_settings(config: Mapping[str, Any]) -> Experiment:
     """Return the experiment of a composed configuration; raises :class:`UserError` if a setting is invalid."""
     extra = set(config) - _known_keys()
@@ -306,7 +294,6 @@ def from_settings(config: Mapping[str, Any]) -> Experiment:
     return Experiment(
         name=_name(config),
         study=study,
-        columns=study.columns,
         timing=study.timed if timing is None else coerce(bool, timing, "timing"),
         execution=_execution(config),
         choices=choices,
@@ -320,7 +307,7 @@ def from_settings(config: Mapping[str, Any]) -> Experiment:
         answer=_text(config, "answer"),
         marks=_mapping(config, "marks"),
         compares=_compares(config),
-        formats=tuple(_one_of("formats", item, FORMATS) for item in _as_list(config["formats"])),
+        formats=tuple(_one_of("formats", item, ("png", "svg", "pdf")) for item in _as_list(config["formats"])),
         chart_columns=int(_one_of("chart_columns", str(config["chart_columns"]), ("1", "2"))),
         reference=cast(Budget, build(Budget, _mapping(config, "reference", parameters(Budget)))),
         compile_cache=_compile_cache(config["compile_cache"]),
@@ -344,11 +331,11 @@ def _text(config: Mapping[str, Any], key: str) -> str:
 
 def _name(config: Mapping[str, Any]) -> str:
     name = "" if config["name"] is None else str(config["name"])
-    if not SAFE_NAME.fullmatch(name) or ".." in name:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", name) or ".." in name:
         raise UserError(
             f"name={name[:200]!r} must be at most 100 letters, digits, '.', '_' and '-', since it names a folder"
         )
-    if name in RESERVED:
+    if name in ("claims", "references", "standard", "trace"):
         raise UserError(f"name={name} is reserved for a folder of results_dir that is not an experiment")
     return name
 
@@ -425,11 +412,11 @@ def _compile_cache(value: Any) -> Path | None:
 
 
 def _execution(config: Mapping[str, Any]) -> Execution:
-    memory = _amount("memory", config["memory"], BYTES, "4g, 500m")
+    timeout = config["timeout"]
     return Execution(
         workers=check(Parameter("workers", int | None, None, low=0), config["workers"], "workers"),
-        timeout=_amount("timeout", config["timeout"], SECONDS, "600, 10m"),
-        memory=None if memory is None else math.ceil(memory),
+        timeout=None if timeout is None else parse_duration(timeout, "timeout"),
+        memory=_bytes(config["memory"]),
         stop=_one_of("on_error", config["on_error"], ("continue", "stop")) == "stop",
         ladder=coerce(bool, config["ladder"], "ladder"),
         versions=_one_of("versions", config["versions"], ("ignore", "warn", "rerun")),
@@ -458,19 +445,17 @@ def _one_of(key: str, value: Any, allowed: Sequence[str]) -> str:
     return str(value)
 
 
-def _amount(key: str, value: Any, units: Mapping[str, float], example: str) -> float | None:
-    """Return an amount such as ``10m`` as a number of base units, greater than 0, or None for no limit."""
+def _bytes(value: Any) -> int | None:
+    """Return an amount of memory such as ``4g`` in bytes, greater than 0, or None for no limit."""
     if value is None:
         return None
-    text = str(value).strip().lower()
-    number, unit = (text[:-1], text[-1:]) if text[-1:] in units else (text, "")
-    try:
-        amount = float(number) * units.get(unit, 1.0)
-    except ValueError:
-        amount = math.nan
-    if isinstance(value, bool) or not 0 < amount < math.inf:
-        raise UserError(f"{key}={value!r} must be an amount such as {example}, greater than 0, or null for no limit")
-    return amount
+    text, amount = str(value).strip().lower(), math.nan
+    unit = {"k": 2.0**10, "m": 2.0**20, "g": 2.0**30}.get(text[-1:])
+    with suppress(ValueError):
+        amount = float(text[:-1] if unit else text) * (unit or 1.0)
+    if not 0 < amount < math.inf:
+        raise UserError(f"memory={value!r} must be an amount such as 4g, 500m, greater than 0, or null for no limit")
+    return math.ceil(amount)
 
 
 def _mapping(config: Mapping[str, Any], key: str, allowed: Collection[str] = ()) -> dict[str, Any]:

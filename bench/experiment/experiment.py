@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -68,10 +67,8 @@ class Experiment:
     """A named sweep: plugins, parameters, sample counts, and the study that measures each cell."""
 
     name: str
-    study: Plugin
-    """The :class:`bench.experiment.study.Study` that measures each cell."""
-    columns: Columns
-    """The columns of its rows, as the study declares them."""
+    study: Any
+    """The :class:`bench.experiment.study.Study` that measures it; its module imports this one."""
     choices: Mapping[str, Sequence[Choice]]
     """The chosen plugins by axis (``scene``, ...), in the order of the study's axes."""
     values: Mapping[str, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
@@ -110,6 +107,11 @@ class Experiment:
     execution: Execution = Execution()
 
     @property
+    def columns(self) -> Columns:
+        """The columns of its rows, as the study declares them."""
+        return self.study.columns
+
+    @property
     def directory(self) -> Path:
         """Folder of the experiment's files."""
         return self.results_dir / self.name
@@ -120,27 +122,21 @@ class Experiment:
         return {"union": [one.sweep for one in (self, *self.also)]} if self.also else self.sweep
 
     def record(self) -> dict[str, Any]:
-        """Return the whole experiment as JSON-like values, for ``run.json``."""
+        """Return the whole experiment for ``run.json``: values of JSON, and others whose strings stand for them."""
+        counts = ("descent", "samples", "repeats", "seed", "timing", "marks", "compares", "formats", "chart_columns")
         return {
             "name": self.name,
             "study": described(self.study),
             "question": self.question,
-            **{registry.kind_of(axis): [str(choice) for choice in some] for axis, some in self.choices.items()},
+            **{registry.kind_of(axis): some for axis, some in self.choices.items()},
             "parameters": self.values,
             "sweep": self.sweep,
             "also": [other.record() for other in self.also],
-            "theta": list(self.decision.names),
-            "theta0": None if self.decision.at is None else list(self.decision.at),
-            "path": [str(choice) for choice in self.path.values()],
-            **{
-                name: getattr(self, name)
-                for name in ("descent", "samples", "repeats", "seed", "timing", "marks", "compares")
-            },
-            "formats": list(self.formats),
-            "chart_columns": self.chart_columns,
-            "reference": dataclasses.asdict(self.reference),
-            "results_dir": str(self.results_dir),
-            "compile_cache": None if self.compile_cache is None else str(self.compile_cache),
-            "plugins": [str(path) for path in self.plugins],
-            "execution": {k: v for k, v in dataclasses.asdict(self.execution).items() if k != "shard"},
+            "theta": self.decision.names,
+            "theta0": self.decision.at,
+            "path": [*self.path.values()],
+            **{name: getattr(self, name) for name in counts},
+            "reference": vars(self.reference),
+            **{name: getattr(self, name) for name in ("results_dir", "compile_cache", "plugins")},
+            "execution": {k: v for k, v in vars(self.execution).items() if k != "shard"},
         }

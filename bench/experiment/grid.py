@@ -12,10 +12,9 @@ from typing import Any
 from bench.errors import Unsupported, UserError, unknown
 from bench.experiment.cell import DESCENDED, Cell
 from bench.experiment.experiment import Choice, Experiment
-from bench.experiment.parameters import DESCENT, THETA, applies
-from bench.experiment.study import study_of
+from bench.experiment.parameters import DESCENT, PROBLEM, THETA, applies
 from bench.host.parameters import build, coerce, parameters, singular
-from bench.model import Decision, MechanicalScene, Plugin, compose
+from bench.model import ContactLaw, Decision, MechanicalScene, Plugin, compose
 from bench.model.program import OWN
 
 MAX_CELLS = 1_000_000
@@ -47,10 +46,9 @@ def cells(experiment: Experiment) -> list[Cell]:
         [c.entry.plugin for some in experiment.choices.values() for c in some if c.entry.plugin],
     )
     unique: dict[str, Cell] = {}
-    expansion = _Expansion(experiment)
     for point in expand(experiment.sweep):
         for choices in itertools.product(*experiment.choices.values()):
-            cell = expansion.cell(point, dict(zip(experiment.choices, choices, strict=True)))
+            cell = _cell(experiment, point, dict(zip(experiment.choices, choices, strict=True)))
             unique.setdefault(cell.key, cell)
     for cell in (cell for other in experiment.also for cell in cells(other)):
         unique.setdefault(cell.key, cell)
@@ -202,106 +200,102 @@ def check_axes(axes: Sequence[str], plugins: Sequence[type[Plugin]]) -> None:
             raise unknown("sweep axis", axis, names)
 
 
-class _Expansion:
-    """Creates the cells of an experiment, and builds each plugin once for all cells that share its values."""
+def _cell(experiment: Experiment, point: Mapping[str, Any], choices: Mapping[str, Choice]) -> Cell:
+    """Return the cell of these choices at a point of the sweep."""
+    used: dict[str, str] = {}
+    parts: dict[str, Plugin | None] = {}
+    for axis, choice in choices.items():
+        is_used = _uses(parts.get("scene"), axis)
+        parts[axis] = _plugin(experiment, axis, choice, point, used, parts.get("scene")) if is_used else None
+    decision = start = _decision(experiment, point, parts)
+    if share := share_of(point.get(DESCENT, experiment.descent)):
+        decision = dataclasses.replace(start, descent=share)
+    parts = experiment.study.parts(parts)
+    return Cell(
+        parts,
+        **_counts(experiment, point),
+        study=experiment.study,
+        decision=decision,
+        timing=experiment.timing,
+        budget=experiment.reference if experiment.study.compares(parts) else None,
+        path=_path(experiment, parts["scene"], start) if share else None,
+        swept=tuple(parameter_name(axis) for axis in used if parts["scene"] and used[axis] == parts["scene"].name),
+    )
 
-    def __init__(self, experiment: Experiment) -> None:
-        self._experiment = experiment
 
-    def cell(self, point: Mapping[str, Any], choices: Mapping[str, Choice]) -> Cell:
-        """Return the cell of these choices at a point of the sweep."""
-        used: dict[str, str] = {}
-        parts: dict[str, Plugin | None] = {}
-        for axis, choice in choices.items():
-            if _uses(parts.get("scene"), axis):
-                given = getattr(parts["scene"], "contact_values", {}) if axis == "contact" else {}
-                parts[axis] = self._plugin(axis, choice, point, used, given)
-            else:
-                parts[axis] = None
-        experiment = self._experiment
-        decision = start = self._decision(point, parts)
-        if share := share_of(point.get(DESCENT, experiment.descent)):
-            decision = dataclasses.replace(start, descent=share)
-        study = study_of(experiment)
-        parts = study.parts(parts)
-        return Cell(
-            parts,
-            **self._counts(point),
-            study=experiment.study,
-            decision=decision,
-            timing=experiment.timing,
-            budget=experiment.reference if study.compares(parts) else None,
-            path=self._path(parts["scene"], start) if share else None,
-            swept=tuple(parameter_name(axis) for axis in used if parts["scene"] and used[axis] == parts["scene"].name),
-        )
+def _path(experiment: Experiment, scene: Plugin | None, start: Decision) -> Cell:
+    """Return the cell at the start of a descent; its contact law has the scene's own values, and none of the sweep's."""
+    parts: dict[str, Plugin | None] = {"scene": scene}
+    for axis in DESCENDED:
+        choice = experiment.path.get(axis)
+        parts[axis] = None
+        if choice is not None and choice.entry.plugin is not None and _uses(scene, axis):
+            values = _of_scene(scene, choice.entry.plugin) | dict(choice.values)
+            parts[axis] = _build(choice.entry.plugin, sorted(values.items()))
+    return Cell(parts, samples=0, repeats=0, seed=0, study=experiment.study, decision=start)
 
-    def _path(self, scene: Plugin | None, start: Decision) -> Cell:
-        """Return the cell at the start of a descent; its contact law has the scene's own values, and none of the sweep's."""
-        parts: dict[str, Plugin | None] = {"scene": scene}
-        for axis in DESCENDED:
-            choice = self._experiment.path.get(axis)
-            parts[axis] = None
-            if choice is not None and choice.entry.plugin is not None and _uses(scene, axis):
-                own = getattr(scene, "contact_values", {}) if axis == "contact" else {}
-                values = {k: v for k, v in own.items() if k in parameters(choice.entry.plugin)}
-                parts[axis] = _build(choice.entry.plugin, sorted((values | dict(choice.values)).items()))
-        return Cell(parts, samples=0, repeats=0, seed=0, study=self._experiment.study, decision=start)
 
-    def _decision(self, point: Mapping[str, Any], parts: Mapping[str, Plugin | None]) -> Decision:
-        """Return theta at a point of the sweep; coordinates that are not swept keep their values."""
-        decision = self._experiment.decision
-        given = {name: coerce_finite(values, name) for name, values in point.items() if is_theta_axis(name)}
-        if not given:
-            return decision
-        if THETA in given:
-            if len(given) > 1:
-                raise UserError(f"the sweep gives theta0 and {', '.join(given.keys() - {THETA})}: give one of them")
-            return dataclasses.replace(decision, at=given[THETA])
-        try:
-            scene, contact, integrator = (parts.get(axis) for axis in ("scene", "contact", "integrator"))
-            at = compose(scene, contact, integrator, study_of(self._experiment).decision(decision)).theta0.tolist()  # type: ignore[arg-type]
-        except (Unsupported, UserError):  # the cell reports the error in its row
-            return decision
-        for name, values in given.items():
-            coordinate = int(name.partition(".")[2])
-            if coordinate >= len(at):
-                raise UserError(f"sweep axis '{name}': theta has {len(at)} coordinates, counted from 0")
-            (at[coordinate],) = values
-        return dataclasses.replace(decision, at=tuple(at))
+def _decision(experiment: Experiment, point: Mapping[str, Any], parts: Mapping[str, Plugin | None]) -> Decision:
+    """Return theta at a point of the sweep; coordinates that are not swept keep their values."""
+    decision = experiment.decision
+    given = {name: coerce_finite(values, name) for name, values in point.items() if is_theta_axis(name)}
+    if not given:
+        return decision
+    if THETA in given:
+        if len(given) > 1:
+            raise UserError(f"the sweep gives theta0 and {', '.join(given.keys() - {THETA})}: give one of them")
+        return dataclasses.replace(decision, at=given[THETA])
+    try:
+        program: list[Any] = [*map(parts.get, PROBLEM), experiment.study.decision(decision)]
+        at = compose(*program).theta0.tolist()
+    except (Unsupported, UserError):  # the cell reports the error in its row
+        return decision
+    for name, values in given.items():
+        coordinate = int(name.partition(".")[2])
+        if coordinate >= len(at):
+            raise UserError(f"sweep axis '{name}': theta has {len(at)} coordinates, counted from 0")
+        (at[coordinate],) = values
+    return dataclasses.replace(decision, at=tuple(at))
 
-    def _counts(self, point: Mapping[str, Any]) -> dict[str, Any]:
-        counts: dict[str, int] = {}
-        for name, low in (("samples", 1), ("repeats", 2), ("seed", 0)):
-            count = coerce(int, point.get(name, getattr(self._experiment, name)), name)
-            if count < low:
-                raise UserError(f"{name}={count} must be at least {low}")
-            counts[name] = count
-        return counts
 
-    def _plugin(
-        self,
-        group: str,
-        choice: Choice,
-        point: Mapping[str, Any],
-        used: dict[str, str],
-        given: Mapping[str, Any],
-    ) -> Plugin:
-        plugin = choice.entry.plugin
-        if plugin is None:
-            raise UserError(f"{group} '{choice.entry.name}' cannot be used: {choice.entry.reason}")
-        axes = _axes_of(plugin, tuple(point))
-        for axis, parameter in axes:
-            if axis in used:
-                raise UserError(
-                    f"sweep axis '{axis}' is a parameter of both {used[axis]} and {plugin.name}: "
-                    f"write sweep.{used[axis]}.{parameter} or sweep.{plugin.name}.{parameter}"
-                )
-            used[axis] = plugin.name
-        values = {k: v for k, v in given.items() if k in parameters(plugin)}
-        # later values replace earlier ones: the scene's contact values, settings, identity string, sweep
-        values |= self._experiment.values.get(group, {}).get(plugin.name, {})
-        values |= dict(choice.values) | {parameter: point[axis] for axis, parameter in axes}
-        return _build(plugin, sorted(values.items()))
+def _counts(experiment: Experiment, point: Mapping[str, Any]) -> dict[str, Any]:
+    counts: dict[str, int] = {}
+    for name, low in zip(COUNTS, (1, 2, 0), strict=True):
+        counts[name] = coerce(int, point.get(name, getattr(experiment, name)), name)
+        if counts[name] < low:
+            raise UserError(f"{name}={counts[name]} must be at least {low}")
+    return counts
+
+
+def _plugin(
+    experiment: Experiment,
+    axis: str,
+    choice: Choice,
+    point: Mapping[str, Any],
+    used: dict[str, str],
+    scene: Plugin | None,
+) -> Plugin:
+    plugin = choice.entry.plugin
+    if plugin is None:
+        raise UserError(f"{axis} '{choice.entry.name}' cannot be used: {choice.entry.reason}")
+    axes = _axes_of(plugin, tuple(point))
+    for name, parameter in axes:
+        if name in used:
+            raise UserError(
+                f"sweep axis '{name}' is a parameter of both {used[name]} and {plugin.name}: "
+                f"write sweep.{used[name]}.{parameter} or sweep.{plugin.name}.{parameter}"
+            )
+        used[name] = plugin.name
+    # later values replace earlier ones: the scene's contact values, settings, identity string, sweep
+    values = dict(_of_scene(scene, plugin), **experiment.values.get(axis, {}).get(plugin.name, {}))
+    values |= dict(choice.values) | {parameter: point[name] for name, parameter in axes}
+    return _build(plugin, sorted(values.items()))
+
+
+def _of_scene(scene: Plugin | None, plugin: type[Plugin]) -> dict[str, Any]:
+    """Return the scene's own values of the parameters of its contact law; empty for another plugin."""
+    given = getattr(scene, "contact_values", {}) if issubclass(plugin, ContactLaw) else {}
+    return {name: value for name, value in given.items() if name in parameters(plugin)}
 
 
 def _uses(scene: Plugin | None, axis: str) -> bool:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +15,6 @@ from bench.host.identity import split_items
 
 GLOBAL = "# @package _global_"
 """The first line of an experiment file, so that Hydra does not nest its settings."""
-RANGE = re.compile(r"range\(([^()]*)\)")
-_NUMBER = r"\s*[+-]?(?:(?:0|[1-9]\d*)(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?\s*"
-NUMBERS = re.compile(rf"\[{_NUMBER}(?:,{_NUMBER})*\]")
-"""A list of numbers."""
 TABLES = ("sweep", "marks", "compares", "reference")
 """Settings that are tables; the parameters of plugins are too."""
 LISTS_AS = "write key=value with lists as [a,b] and strings in quotes"
@@ -55,7 +53,7 @@ def with_ranges(key: str, value: str) -> str:
     """
     if key.partition(".")[0] not in ("sweep", "theta0") or "'" in value or '"' in value:
         return value
-    return RANGE.sub(lambda match: f"[{','.join(map(str, _range(key, match)))}]", value)
+    return re.sub(r"range\(([^()]*)\)", lambda match: f"[{','.join(map(str, _range(key, match)))}]", value)
 
 
 def _range(key: str, match: re.Match[str]) -> range:
@@ -74,12 +72,13 @@ def _range(key: str, match: re.Match[str]) -> range:
 def parse(given: str, word: str) -> Override:
     """Return the keys and the value of an override in Hydra's syntax; ``given`` is the user's, which errors name.
 
-    A list of numbers, which may be long, is read without Hydra's grammar: that takes a millisecond per number.
+    A list that is JSON, which may be long, is read without Hydra's grammar: that takes a millisecond per number.
     """
     key, _, value = word.partition("=")
+    if value.startswith("[") and "\\" not in value:
+        with suppress(ValueError, RecursionError):
+            return key.split("."), json.loads(value)
     try:
-        if NUMBERS.fullmatch(value):
-            return key.split("."), [float(n) if set(n) & set(".eE") else int(n) for n in value[1:-1].split(",")]
         from hydra.core.override_parser.overrides_parser import OverridesParser
 
         override = OverridesParser.create().parse_override(word)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 
 from bench.host.parameters import build, remember
-from bench.model import Backend, Problem, Program, registry
+from bench.model import Backend, Program, registry
 
 
 def capable_backends(program: Program, for_references: bool = False) -> list[Backend]:
@@ -37,4 +37,4 @@ def _default(plugin: type[Backend]) -> Backend:
 
 def backends_with_jacobians(program: Program) -> list[str]:
     """Return the names of the available backends whose problems provide step Jacobians of a program."""
-    return [b.name for b in capable_backends(program) if type(b.compile(program)).jacobians is not Problem.jacobians]
+    return [backend.name for backend in capable_backends(program) if backend.compile(program).gives_jacobians]

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from bench.errors import UserError
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Columns
 from bench.experiment.experiment import Experiment
@@ -57,7 +56,7 @@ class Study(Plugin):
 
     def compares(self, parts: Mapping[str, Plugin | None]) -> bool:
         """Return whether a cell with these plugins needs a reference gradient; by default if the rows have its method."""
-        return self.columns.referenced
+        return "reference_method" in self.columns.by_name
 
     def refusal(self, cell: Cell) -> str | None:
         """Return why the study cannot measure a cell, or None; called when a run is planned."""
@@ -75,14 +74,6 @@ class Study(Plugin):
         """Return why measured rows do not pass as a rung of a ladder, in words; empty if they pass, as without faults."""
         count = self.faults(rows)
         return f"{count} of {len(rows)} cells {'has' if count == 1 else 'have'} a fault" if count else ""
-
-
-def study_of(experiment: Experiment) -> Study:
-    """Return the experiment's study; raises :class:`UserError` for a plugin that is not a :class:`Study`."""
-    study = experiment.study
-    if not isinstance(study, Study):
-        raise UserError(f"study {study.name} does not derive from bench.plugin.Study")
-    return study
 
 
 def columns_of(study: str) -> Columns:

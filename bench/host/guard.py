@@ -18,14 +18,12 @@ MAX_CAPTURED_CHARACTERS = 300
 """Maximum number of characters of a plugin's output that are quoted."""
 LIBRARIES = ("bench", "builtins", "json", "math", "numpy", "os", "pandas", "scipy")
 """Packages whose functions compute or store numbers in the process of a command."""
-DEATH_SIGNAL = 1
-"""PR_SET_PDEATHSIG of prctl(2)."""
 
 
 def die_with(parent: int) -> None:
     """Make the kernel kill this process when its parent, of that id, ends (Linux)."""
     with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None, use_errno=True).prctl(DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
+        ctypes.CDLL(None, use_errno=True).prctl(1, signal.SIGKILL, 0, 0, 0)  # PR_SET_PDEATHSIG
     if os.getppid() != parent:
         os._exit(1)
 

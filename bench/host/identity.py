@@ -30,11 +30,9 @@ def text_of(value: Any) -> str:
         return "null"
     if isinstance(value, bool):
         return str(value).lower()
-    return repr(value) if isinstance(value, float) and not value.is_integer() else _short(value)
-
-
-def _short(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) and float(f"{value:g}") == value else str(value)
+    if isinstance(value, float) and value.is_integer() and float(f"{value:g}") == value:
+        return f"{value:g}"
+    return str(value)
 
 
 def parse_identity(text: str) -> tuple[str, dict[str, Any]]:

@@ -14,8 +14,6 @@ from threadpoolctl import threadpool_limits
 
 X64 = "JAX_ENABLE_X64"
 """Environment variable with which JAX computes in float64 from its import on."""
-LIBRARIES = ("numpy", "scipy.special", "jax", "torch")
-"""The libraries whose threads are limited."""
 
 
 class ProcessState:
@@ -42,7 +40,7 @@ class ProcessState:
 
     def follow(self) -> None:
         """Limit the threads of the libraries that have been imported since."""
-        new = (set(LIBRARIES) - self._limited) & sys.modules.keys()
+        new = ({"numpy", "scipy.special", "jax", "torch"} - self._limited) & sys.modules.keys()
         if new and self._single_thread:
             self._ends.enter_context(threadpool_limits(1))
         self._limited |= new

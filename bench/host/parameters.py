@@ -8,7 +8,7 @@ import sys
 import types
 import typing
 from abc import ABC
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, ClassVar, Self, TypeVar, cast
@@ -162,15 +162,6 @@ def parameters(plugin: type[Plugin]) -> dict[str, Parameter]:
 def values(plugin: Plugin) -> dict[str, Any]:
     """Return all parameters of a plugin with their values, defaults included."""
     return {name: getattr(plugin, name) for name in parameters(type(plugin))}
-
-
-def named(plugins: Iterable[type[Plugin]], name: str) -> Parameter | None:
-    """Return the parameter that theta names ``mass`` or ``pushing.mass``, of the first of the plugins that has it."""
-    owner, _, own = name.rpartition(".")
-    for plugin in plugins:
-        if own in parameters(plugin) and owner in ("", singular(plugin.kind), plugin.name):
-            return parameters(plugin)[own]
-    return None
 
 
 def traced(plugin: Plugin) -> list[str]:

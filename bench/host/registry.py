@@ -20,7 +20,7 @@ import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
@@ -119,7 +119,8 @@ def _package(path: Path) -> str:
 def entries() -> Table:
     """Return all plugins by kind and name."""
     table: Table = {kind: {} for kind in KINDS}
-    packages = {_package(path): path for path in _folders if _only is None or _is_needed(_package(path))}
+    needed = None if _only is None else {name.partition(".")[0] for name in _only}
+    packages = {_package(path): path for path in _folders if needed is None or _package(path) in needed}
     modules = [module for name in (BUILT_IN, *packages) for module in _modules(importlib.import_module(name))]
     # only one command uses these: entries_with has them, and other commands do not import them
     modules = [part for part in modules if not part[1].startswith("bench.plugins.claims")]
@@ -153,10 +154,6 @@ def environment() -> dict[str, str]:
     return {name: value for name, value in (os.environ | _environment).items() if value is not None}
 
 
-def _is_needed(package: str) -> bool:
-    return any(name.startswith(f"{package}.") for name in _only or ())
-
-
 def entries_with(kind: str) -> dict[str, Entry]:
     """Return all plugins of a kind on demand: built-in ones, those of entry points ``bench.KIND`` and of the registry.
 
@@ -182,21 +179,18 @@ def kinds() -> list[str]:
 
 def _modules(package: ModuleType) -> Iterator[tuple[str, str]]:
     """Yield (kind, full name) of each module in a package and its subfolders; the kind is the module's folder name."""
-    for module in sorted(pkgutil.iter_modules(package.__path__), key=lambda m: m.name):
-        name = f"{package.__name__}.{module.name}"
-        if module.name in NOT_PLUGINS and package.__name__.rpartition(".")[2] not in KINDS:
+    for path in sorted(path for place in package.__path__ for path in Path(place).iterdir()):
+        name, is_package = path.stem, (path / "__init__.py").exists()
+        full = f"{package.__name__}.{name}"
+        # a folder of plugins need not have an __init__.py
+        is_folder = path.is_dir() and name.isidentifier() and not is_package and any(path.glob("*.py"))
+        if name in NOT_PLUGINS or name == "__init__":
             continue
-        if module.name in KINDS:
-            yield from ((module.name, path) for _, path in _modules(importlib.import_module(name)))
-        else:
-            yield package.__name__.rpartition(".")[2], name
-    for folder in sorted(path for place in package.__path__ for path in Path(place).iterdir()):
-        # folders without __init__.py are (namespace) packages too, but pkgutil does not list them
-        is_package = (folder / "__init__.py").exists() or not any(folder.glob("*.py"))
-        if folder.name.isidentifier() and folder.name not in NOT_PLUGINS and not is_package:
-            space = importlib.import_module(f"{package.__name__}.{folder.name}")
-            for module in sorted(pkgutil.iter_modules(space.__path__), key=lambda m: m.name):
-                yield folder.name, f"{space.__name__}.{module.name}"
+        if is_folder or (is_package and name in KINDS):
+            for module in pkgutil.iter_modules(importlib.import_module(full).__path__):
+                yield name, f"{full}.{module.name}"
+        elif is_package or path.suffix == ".py":
+            yield package.__name__.rpartition(".")[2], full
 
 
 def _load(
@@ -361,12 +355,7 @@ def make(kind: str, name: str, values: Mapping[str, Any] | None = None) -> Any:
 
 def kind_of(axis: str) -> str:
     """Return the kind of an axis: ``scenes`` for ``scene``; raises :class:`UserError` for an unknown axis."""
-    known = _by_axis(tuple(kinds()))
+    known = {singular(kind): kind for kind in reversed(kinds())}
     if axis not in known:
         raise unknown("axis", axis, known)
     return known[axis]
-
-
-@cache
-def _by_axis(kinds: tuple[str, ...]) -> dict[str, str]:
-    return {singular(kind): kind for kind in reversed(kinds)}

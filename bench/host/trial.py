@@ -23,8 +23,6 @@ from bench.host import guard
 
 TIMEOUT_S = 60.0
 """Time limit of the import of a file, in seconds."""
-MAX_NAME = 200
-"""Characters that are read of the name of a function that a file has replaced."""
 MARK = "BENCH_TRIAL"
 """Environment variable of a trial process and all processes that it starts."""
 CHILD_CODE = (
@@ -94,7 +92,7 @@ def _try_imports(names: Sequence[str], packages: Mapping[str, Path], timeout_s: 
         finally:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
-        written = os.pread(output.fileno(), len(names) + MAX_NAME, 0)
+        written = os.pread(output.fileno(), len(names) + 200, 0)
     code, n_started, last = process.wait(), written.count(b"\n"), written.rpartition(b"\n")[2].decode(errors="replace")
     if last == "!":
         return n_started, ""

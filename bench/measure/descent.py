@@ -22,8 +22,6 @@ PAIRS = 1024
 """Pairs of rollouts with noise of either sign, the same at every step: J_sigma is their mean cost."""
 GROWTH, STRAIGHT = 1.5, 0.9
 """The step size grows by this factor where the gradient along a step falls to no less than this share, and is halved elsewhere."""
-WINDOW, ENOUGH = 10, 1e-3
-"""A descent ends where this many steps have gained less than this share of its whole gain."""
 
 
 class DescentPoint(NamedTuple):
@@ -110,11 +108,6 @@ class _Steps:
     costs: list[float]
     slopes: list[np.ndarray]
 
-    def has_gained_all(self) -> bool:
-        """Return whether the last steps have gained a negligible share of the whole gain."""
-        costs = self.costs
-        return len(costs) > WINDOW and costs[-1 - WINDOW] - costs[-1] < ENOUGH * (costs[0] - costs[-1])
-
 
 @np.errstate(over="ignore", invalid="ignore")
 def descend(problem: Problem) -> DescentPath:
@@ -170,7 +163,8 @@ def _followed(objective: _Objective, theta: np.ndarray, w: np.ndarray) -> tuple[
         path.costs.append(reached)
         path.slopes.append(objective.gradient(new, w))
         step *= GROWTH if path.slopes[-1] @ path.slopes[-2] >= STRAIGHT * size**2 else 0.5
-        if path.has_gained_all():
+        # the last steps have gained a negligible share of the whole gain
+        if len(path.costs) > 10 and path.costs[-11] - reached < 1e-3 * (path.costs[0] - reached):
             break
         # most steps, and the distance of theta from 0, relative to that length, from which costs count as unbounded below
         if len(path.costs) > 400 or np.linalg.norm(new) > 1e3 * scale:

@@ -13,8 +13,6 @@ from bench.model import Problem
 
 PARTS = 64
 """Default number of intervals of each line at the first level."""
-SUSPECTS = 32
-"""Number of intervals refined at each level."""
 FINEST = 1e-11
 """Interval length, as a share of the line, at which a change of the cost that no longer shrinks is a jump."""
 LOUD = 100.0
@@ -52,22 +50,13 @@ class Jump(NamedTuple):
     """Place of the jump on its line, from 0 at the start to 1 at the end."""
 
 
-class MissedSlope(NamedTuple):
-    """The part of the mean slope along a line through the noise that sampled gradients do not have."""
-
-    share: float
-    """The missed slope over the largest mean slope of all lines; 0 where gradients miss nothing that matters."""
-    w: np.ndarray
-    """The noise ``(n_w,)`` where most of it lies."""
-
-
 class Lost(NamedTuple):
-    """Samples of the noise at which a cost, or a gradient of a cost that is a number, is NaN or infinite."""
+    """What is lost of the mean of gradients: samples that are NaN or infinite, or a part of the mean slope along a line."""
 
     share: float
-    """Share of the samples; 0 without any."""
+    """Share of the samples, or of the largest mean slope of all lines; 0 where nothing is lost."""
     w: np.ndarray
-    """The noise ``(n_w,)`` of the sample nearest to theta; 0 without any."""
+    """The noise ``(n_w,)`` of the sample nearest to theta, or where most of the slope lies; 0 where nothing is lost."""
 
 
 class Sampled(NamedTuple):
@@ -83,13 +72,8 @@ class Sampled(NamedTuple):
 def sampled_gradients(problem: Problem, theta: np.ndarray, seed: int, columns: int) -> Sampled:
     """Return what samples of the noise show of costs and gradients at ``theta (d,)``."""
     w = np.random.default_rng([seed, 0x6C6F7374]).standard_normal((problem.program.n_noise, DRAWS))
-
-    def both(part: np.ndarray) -> np.ndarray:
-        at = np.repeat(theta[:, None], part.shape[1], axis=1)
-        return np.concatenate([problem.value(at, part)[None], problem.grad(at, part)])
-
     with np.errstate(all="ignore"):
-        found = in_columns(both, w, columns)
+        found = _costs_and_gradients(problem, theta, w, columns)
         variance = float(found[1:].var(axis=1, ddof=1).sum())
         square = float(np.square(found[1:].mean(axis=1)).sum()) - variance / DRAWS
         spread = math.sqrt(variance / square) if square > 0.0 and math.isfinite(variance) else math.inf
@@ -103,7 +87,18 @@ def sampled_gradients(problem: Problem, theta: np.ndarray, seed: int, columns: i
     return Sampled(lost(has_cost & ~has_gradient), lost(~has_cost), spread)
 
 
-def missed_slope(problem: Problem, theta: np.ndarray, seed: int, columns: int) -> MissedSlope:
+def _costs_and_gradients(problem: Problem, theta: np.ndarray, w: np.ndarray, columns: int) -> np.ndarray:
+    """Return costs and gradients at ``theta (d,)`` under noise ``w (n_w, B)``, ``(1 + d, B)``."""
+
+    def both(part: np.ndarray) -> np.ndarray:
+        # one theta per column, the shape that a compiling backend has compiled for differences
+        at = np.repeat(theta[:, None], part.shape[1], axis=1)
+        return np.concatenate([problem.value(at, part)[None], problem.grad(at, part)])
+
+    return in_columns(both, w, columns)
+
+
+def missed_slope(problem: Problem, theta: np.ndarray, seed: int, columns: int) -> Lost:
     """Return the slope of the mean cost at ``theta (d,)`` that sampled gradients miss, on lines through its noise.
 
     On a line, the derivative of the mean cost is E[f(t) t] for a standard normal t, from costs, and E[f'(t)] from
@@ -112,21 +107,16 @@ def missed_slope(problem: Problem, theta: np.ndarray, seed: int, columns: int) -
     chaos. Only noise that acts on theta has gradients along a line; the share is 0 for other noise.
     """
     width, dim = problem.program.n_noise, problem.dim
-    nothing = MissedSlope(0.0, np.zeros(width))
+    nothing = Lost(0.0, np.zeros(width))
     if not problem.noise_on_theta or not problem.sigma > 0.0:
         return nothing
     directions = _lines_of_slopes(dim, np.random.default_rng([seed, 0x736C6F70]))
     t = np.linspace(-FAR, FAR, NODES)
-    points = (directions[:, :, None] * t).reshape(dim, -1)
-
-    def along(part: np.ndarray) -> np.ndarray:
-        w = np.concatenate([part, np.zeros((width - dim, part.shape[1]))])
-        at = np.repeat(theta[:, None], part.shape[1], axis=1)
-        return np.concatenate([problem.value(at, w)[None], problem.sigma * problem.grad(at, w)])
-
+    points = np.zeros((width, directions.shape[1] * NODES))
+    points[:dim] = (directions[:, :, None] * t).reshape(dim, -1)
     with np.errstate(all="ignore"):
-        both = in_columns(along, points, columns).reshape(dim + 1, -1, NODES)
-        costs, slopes = both[0], np.einsum("dl,dlt->lt", directions, both[1:])
+        both = _costs_and_gradients(problem, theta, points, columns).reshape(dim + 1, -1, NODES)
+        costs, slopes = both[0], np.einsum("dl,dlt->lt", directions, problem.sigma * both[1:])
         density = np.exp(-t * t / 2.0) / np.sqrt(2.0 * np.pi) * (t[1] - t[0])
         by_costs = (costs - costs[:, NODES // 2, None]) * t * density
         by_gradients = np.where(np.abs(t) <= MET, slopes, 0.0) * density
@@ -148,13 +138,20 @@ def missed_slope(problem: Problem, theta: np.ndarray, seed: int, columns: int) -
     rest = np.where(np.abs(t[1:]) > MET, np.abs(np.diff(costs[line])), rest) * density[1:]
     w = np.zeros(width)
     w[:dim] = directions[:, line] * t[int(np.argmax(rest))]
-    return MissedSlope(float(shares[line]), w)
+    return Lost(float(shares[line]), w)
+
+
+def coordinates(width: int, most: int) -> np.ndarray:
+    """Return the unit vectors of at most ``most`` evenly spaced coordinates, ``(width, L)``."""
+    chosen = np.unique(np.linspace(0, width - 1, min(width, most)).astype(int))
+    units = np.zeros((width, chosen.size))
+    units[chosen, np.arange(chosen.size)] = 1.0
+    return units
 
 
 def _lines_of_slopes(dim: int, random: np.random.Generator) -> np.ndarray:
     """Return unit vectors ``(d, L)``: coordinates, diagonals of pairs and of all inputs where there are few, random ones."""
-    chosen = np.unique(np.linspace(0, dim - 1, min(dim, LINES)).astype(int))
-    rows = list(np.eye(dim)[chosen])
+    rows = list(coordinates(dim, LINES).T)
     if 1 < dim <= SIGNED:
         signs = np.array(np.meshgrid(*[(-1.0, 0.0, 1.0)] * dim)).reshape(dim, -1).T
         first = signs[np.arange(len(signs)), (signs != 0).argmax(axis=1)]
@@ -183,10 +180,7 @@ def jump_under_noise(problem: Problem, theta: np.ndarray, seed: int, columns: in
 
     changes = cost(samples)
     changes = np.where(np.isfinite(changes), changes - np.nan_to_num(np.median(changes)), 0.0)
-    chosen = np.unique(np.linspace(0, width - 1, min(width, LINES)).astype(int))
-    units = np.zeros((width, chosen.size))
-    units[chosen, np.arange(chosen.size)] = 1.0
-    directions = np.concatenate([units, samples[:, :LINES], (samples @ changes)[:, None]], axis=1)
+    directions = np.concatenate([coordinates(width, LINES), samples[:, :LINES], (samples @ changes)[:, None]], axis=1)
     lengths = np.linalg.norm(directions, axis=0)
     directions = directions[:, lengths > 0.0] / lengths[lengths > 0.0]
     pairs = samples[:, : 2 * LINES], samples[:, 2 * LINES :]
@@ -204,7 +198,7 @@ def largest_jump(
     ``cost`` maps points ``(n, B)`` to ``(B,)``. As intervals of length h shrink, the second difference of a smooth cost
     falls as h^2, at a kink as h, and at a jump it is constant. Three kinds of jumps are missed: jumps below 1e-6 of the
     cost's range on the lines, jumps between two of the first ``parts`` + 1 nodes of a line that do not change the cost
-    at these nodes, and jumps in an interval whose second difference more than :data:`SUSPECTS` other intervals exceed.
+    at these nodes, and jumps in an interval whose second difference more than 32 other intervals exceed.
     Values that are not finite are ignored.
     """
     count = starts.shape[1]
@@ -242,8 +236,8 @@ def largest_jump(
             where = int(line[best]), float(nodes[best, at_jump : at_jump + 2].mean())
             change = float(isolated[best])
             break
-        row, place = np.unravel_index(np.argsort(bends, axis=None)[-SUSPECTS:], bends.shape)
-        # number of intervals into which a suspicious interval and its neighbour are divided at every further level
+        row, place = np.unravel_index(np.argsort(bends, axis=None)[-32:], bends.shape)
+        # the 32 most suspicious intervals and their neighbours are divided into as many at every further level
         line, left, width, parts = line[row], nodes[row, place], 2.0 * width / parts, 32
     if single:
         # steps of rounding are flat at the last level, so that they have no median bend

@@ -11,7 +11,7 @@ import numpy as np
 
 from bench.measure import noise
 from bench.measure.batches import in_columns
-from bench.measure.jumps import largest_jump
+from bench.measure.jumps import coordinates, largest_jump
 from bench.measure.quadrature import TOLERANCE, integrate
 from bench.measure.statistics import THREE, Sampling, Truth, bias_interval, heavy_tails
 from bench.model import Problem, Program
@@ -23,7 +23,6 @@ COLUMNS = 4096
 small. The pilot, which selects the estimator of a sampled reference, is one batch."""
 LEAST_SAMPLES = 16384
 """Minimum samples of a sampled reference, unless the limit is lower: a small spread of few samples proves nothing."""
-QUADRATURE_POINTS = 1 << 20
 TAIL_EVENTS = 10.0
 """Expected samples in the tails. Their contribution is estimated separately, as a spread may not show so few samples."""
 DEEPER = 0.2
@@ -95,7 +94,7 @@ def certify(
     samples: int,
     tolerance: float,
     physical: np.ndarray | None = None,
-    points: int = QUADRATURE_POINTS,
+    points: int = 1 << 20,
 ) -> Reference:
     """Return the reference gradient of a problem, by the best applicable method.
 
@@ -127,8 +126,7 @@ def certify(
             reference = with_note(reference, note)
     if physical is None or "grad" not in provides:
         return reference
-    plain = problem.grad(theta, np.zeros((program.n_noise, 1)))[:, 0]
-    return replace(reference, plain=plain, physical=np.asarray(physical, dtype=np.float64))
+    return replace(reference, plain=problem.grad(), physical=np.asarray(physical, dtype=np.float64))
 
 
 def transferred(reference: Reference, problem: Problem, other: Problem, samples: int, unit: float) -> Reference | None:
@@ -496,10 +494,7 @@ class _Sampler:
 
 def _directions(effect: np.ndarray) -> np.ndarray:
     """Return unit vectors in noise space, ``(n_w, L)``: evenly spaced coordinates, and the mean effect's direction."""
-    width = effect.size
-    chosen = np.unique(np.linspace(0, width - 1, min(width, DIRECTIONS)).astype(int))
-    directions = np.eye(width)[:, chosen] if width <= DIRECTIONS else np.zeros((width, chosen.size))
-    directions[chosen, np.arange(chosen.size)] = 1.0
+    directions = coordinates(effect.size, DIRECTIONS)
     length = float(np.linalg.norm(effect))
     return np.column_stack([directions, effect / length]) if length and math.isfinite(length) else directions
 

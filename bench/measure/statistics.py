@@ -119,11 +119,6 @@ class Truth:
     """Norm of an error of unknown direction that ``sampling`` does not show."""
 
     def __post_init__(self) -> None:
-        if self.mean.ndim != 1 or self.mean.size == 0 or self.sampling.rows.shape[1:] != self.mean.shape:
-            raise ValueError(
-                f"a reference gradient is a vector (d,) with errors (K, d), d > 0; given {self.mean.shape} "
-                f"with errors {self.sampling.rows.shape}"
-            )
         finite = np.isfinite(self.mean).all() and np.isfinite(self.sampling.rows).all()
         if not (finite and math.isfinite(self.unseen)):
             raise ValueError("the reference gradient or its error is not finite, so nothing can be compared with it")
@@ -140,9 +135,6 @@ class Truth:
 
         ``unseen`` is the norm of an error that this spread does not show.
         """
-        batches = np.asarray(batches, dtype=np.float64)
-        if batches.ndim != 2 or len(batches) < 2:
-            raise ValueError(f"batch means have the shape (K, d) with K > 1; given {batches.shape}")
         return cls(batches.mean(axis=0), Sampling.of(batches), unseen)
 
     @property
@@ -318,13 +310,7 @@ def variance_per_sample(sums: np.ndarray, squares: np.ndarray, samples: int) -> 
     first. The interval is the jackknife over repeats of :func:`variance_interval`, which accounts for tails. It is
     ``(0, inf)`` for fewer than three repeats, and NaN where there is only one term in total.
     """
-    sums, squares = np.asarray(sums, dtype=np.float64), np.asarray(squares, dtype=np.float64)
     repeats = len(sums)
-    if sums.ndim != 2 or squares.shape != (repeats,) or repeats < 1 or samples < 1:
-        raise ValueError(
-            f"sums have the shape (R, d) and squares (R,) with R > 0 and one sample or more; given {sums.shape}, "
-            f"{squares.shape} and {samples}"
-        )
     count = repeats * samples
     if count < 2:
         return (math.nan,) * 3
@@ -443,10 +429,9 @@ def summarise(
     notes += _reference_remarks(reference, relative)
     if unbiased and bias[1] > 0.0:
         notes.append(f"declared unbiased, and its interval excludes 0: {UNEXPLAINED}, or chance (about 1 row in 30)")
-    per_sample = _ends("variance_per_sample", [value * samples * unit * unit for value in variance])
+    per_sample = tuple(value * samples * unit * unit for value in variance)
     if terms is not None:
-        value, low, high = variance_per_sample(*terms, samples)
-        per_sample = _ends("variance_per_sample", (value, low, high))
+        _, low, high = per_sample = variance_per_sample(*terms, samples)
         # width of the interval of the log variance of terms, times their number, below which it ignores the
         # error of their mean
         if low > 0.0 and math.log(high / low) < 10.0 / (repeats * samples):
@@ -455,10 +440,10 @@ def summarise(
         grad_norm=float(np.linalg.norm(mean)) * unit,
         reference_norm=norm * unit,
         reference_se=reference.standard_error * unit,
-        **_ends("bias", [value * unit for value in bias]),
+        **ends("bias", [value * unit for value in bias]),
         bias_rel=bias[0] / relative,
-        **_ends("variance", [value * unit * unit for value in variance]),
-        **per_sample,
+        **ends("variance", [value * unit * unit for value in variance]),
+        **ends("variance_per_sample", per_sample),
         rmse=error * unit,
         rmse_rel=error / relative,
         cosine=cosine,
@@ -479,8 +464,8 @@ def _check_shapes(estimates: np.ndarray, truth: Truth, samples: int) -> None:
         raise ValueError(f"an estimate is made of one sample or more; given {samples}")
 
 
-def _ends(name: str, values: Iterable[float]) -> dict[str, Any]:
-    """Return the fields of a number and of the ends of its interval."""
+def ends(name: str, values: Iterable[Any]) -> dict[str, Any]:
+    """Return a number, or a list, and the ends of its interval by name, ``<name>_low`` and ``<name>_high``."""
     return dict(zip((name, f"{name}_low", f"{name}_high"), values, strict=True))
 
 

@@ -207,13 +207,11 @@ def _theta_differences(
     """
     if function(theta) is None:
         return np.zeros_like(theta)
-    moved = function(theta + DIFFERENCE_STEP * np.maximum(1.0, np.abs(theta)))
-    back = function(theta - DIFFERENCE_STEP * np.maximum(1.0, np.abs(theta)))
-    if np.array_equal(np.asarray(moved), np.asarray(back)):
+    steps = DIFFERENCE_STEP * np.maximum(1.0, np.abs(theta))
+    if np.array_equal(np.asarray(function(theta + steps)), np.asarray(function(theta - steps))):
         return np.zeros_like(theta)  # the function does not depend on theta: skip the differences by its d coordinates
     result, count = np.empty_like(theta), theta.shape[1]
-    for i in range(len(theta)):
-        h = DIFFERENCE_STEP * np.maximum(1.0, np.abs(theta[i]))
+    for i, h in enumerate(steps):
         ahead, behind = theta.copy(), theta.copy()
         ahead[i] += h
         behind[i] -= h

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
@@ -13,8 +13,6 @@ import numpy as np
 
 MIN_COLUMNS = 512
 """Minimum columns per thread for which another thread saves time; a problem may set its own minimum."""
-MAX_COLUMNS = 1 << 14
-"""Maximum columns per block: larger blocks save no time."""
 
 
 def cores() -> int:
@@ -47,7 +45,8 @@ def _n_listed(ranges: str) -> int:
 def columns_in_cache(column_bytes: int) -> int:
     """Return the number of columns that fill half of a core's cache, within limits."""
     columns = cache_bytes() // 2 // max(column_bytes, 1)
-    return min(max(columns, MIN_COLUMNS), MAX_COLUMNS)
+    # larger blocks save no time
+    return min(max(columns, MIN_COLUMNS), 1 << 14)
 
 
 def n_threads(count: int, threads: int, least: int) -> int:
@@ -87,15 +86,10 @@ def evaluate(
         values = function(theta if shared else _pad(theta[:, part], columns), _pad(w[:, part], columns))
         result[..., part] = values[..., : part.stop - part.start]
 
-    _run_blocks(block, range(0, count, columns), threads)
-    return result
-
-
-def _run_blocks(block: Callable[[int], None], starts: Sequence[int], threads: int) -> None:
-    """Call ``block`` with each start, in this thread or in ``threads`` others."""
     # one pool per process: a forked child inherits the pool but not its threads
     run = _pool(threads, os.getpid()).map if threads > 1 else map
-    list(run(block, starts))
+    list(run(block, range(0, count, columns)))
+    return result
 
 
 def _pad(part: np.ndarray, columns: int) -> np.ndarray:

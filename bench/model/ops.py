@@ -34,12 +34,13 @@ class LoopOps:
         The derivative is computed by the implicit-function theorem. Raises :class:`Unsupported` on backends without
         ``root``.
         """
-        raise Unsupported(NO_ROOT)
+        raise Unsupported(
+            "a step solves an equation, and this backend has no root finder: use a backend that provides root (see `python -m bench list backends`)"
+        )
 
 
 Ops = LoopOps
 """The type of the operations of any backend, with or without ``root``."""
-NO_ROOT = "a step solves an equation, and this backend has no root finder: use a backend that provides root (see `python -m bench list backends`)"
 
 
 def stopped(array: Array) -> Array:

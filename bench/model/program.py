@@ -62,19 +62,20 @@ class Program(ABC):
         self.contact = contact
         self.integrator = integrator
         self.decision = decision
-        self._named = tuple(self._place(name) for name in decision.names)
+        self.named = tuple(self._place(name) for name in decision.names)
+        """(axis, name) of the parameters that are theta; empty for the scene's own theta."""
         self._varying: tuple[tuple[str, str], ...] = ()
         """(axis, name) of the parameters whose values are arrays ``(B,)``, set from theta by :meth:`_own_theta`."""
         if isinstance(contact, ImpulseLaw) and integrator is not None and not integrator.takes_impulses:
             raise Unsupported(f"integrator {integrator.name} cannot apply the impulses of contact law {contact.name}")
         # computed before binding, since the parameters of a bound program may be traced values
-        self._scene_theta0 = scene.theta0() if self._named else np.empty(0)
+        self._scene_theta0 = scene.theta0() if self.named else np.empty(0)
         if decision != OWN:
             self._check_decision()
 
     def _check_decision(self) -> None:
         names, at = list(self.decision.names), self.decision.at
-        if len(set(self._named)) < len(names):
+        if len(set(self.named)) < len(names):
             raise UserError(f"theta={names} names a parameter twice")
         if at is not None and len(at) != self.dim:
             raise UserError(f"theta0 has {len(at)} values, theta of scene {self.scene.name} has {self.dim}")
@@ -97,10 +98,8 @@ class Program(ABC):
     @property
     def needs(self) -> frozenset[str]:
         """Capabilities that a backend must provide to run the program: ``root``, ``physics`` or neither."""
-        needs = {"root"} if self.needs_root else set()
-        if isinstance(self.scene, EngineScene):
-            needs.add("physics")
-        return frozenset(needs)
+        needs = {"root": self.needs_root, "physics": isinstance(self.scene, EngineScene)}
+        return frozenset(name for name, is_needed in needs.items() if is_needed)
 
     @property
     def continuous(self) -> bool:
@@ -123,19 +122,19 @@ class Program(ABC):
             raise Unsupported("theta on a descent is known once the descent is computed")
         if self.decision.at is not None:
             return np.array(self.decision.at, dtype=np.float64)
-        if self._named:
-            return np.array([getattr(self.parts[axis], name) for axis, name in self._named], dtype=np.float64)
+        if self.named:
+            return np.array([getattr(self.parts[axis], name) for axis, name in self.named], dtype=np.float64)
         return self.scene.theta0()
 
     @cached_property
     def dim(self) -> int:
         """d, the length of theta."""
-        return len(self._named) or int(self.scene.theta0().size)
+        return len(self.named) or int(self.scene.theta0().size)
 
     @property
     def noise(self) -> str:
         """The noise model: ``parameter`` or ``action``; always ``parameter`` if theta consists of named parameters."""
-        return "parameter" if self._named else self.scene.noise
+        return "parameter" if self.named else self.scene.noise
 
     @property
     def action_noise(self) -> bool:
@@ -186,7 +185,7 @@ class Program(ABC):
             changing = set(traced(plugin))
             static = [(f.name, getattr(plugin, f.name)) for f in dataclasses.fields(plugin) if f.name not in changing]
             parts.append((axis, type(plugin), tuple(static)))
-        return (*parts, self._named, self._scene_theta0.tobytes()) if self._named else tuple(parts)
+        return (*parts, self.named, self._scene_theta0.tobytes()) if self.named else tuple(parts)
 
     def parameters(self) -> np.ndarray:
         """Return the float parameters of all plugins, which a backend may trace, ``(p,)``."""
@@ -248,7 +247,7 @@ class Program(ABC):
     def _as_declared(self) -> bool:
         """Whether theta and theta0 are the scene's own, so that its known solutions apply to this program."""
         at = self.decision.at
-        return not (self._named or self.decision.descent) and (
+        return not (self.named or self.decision.descent) and (
             at is None or bool(np.array_equal(at, self.scene.theta0()))
         )
 
@@ -266,7 +265,7 @@ class Program(ABC):
 
     def breakpoints(self) -> tuple[tuple[float, ...], ...]:
         """Return, per coordinate of theta, the known positions of the cost's jumps and kinks."""
-        return () if self._named else self.scene.breakpoints()
+        return () if self.named else self.scene.breakpoints()
 
     # ------------------------------------------------------------------------------------------ evaluation
 
@@ -284,9 +283,9 @@ class Program(ABC):
     def _own_theta(self, xp: Any, theta: Array, w: Array) -> tuple[Program, Array]:
         """Return the program with parameters from noisy theta, each ``(B,)``, and the scene's own theta ``(d', B)``."""
         noisy = theta + self.scene.sigma * w
-        values = {place: noisy[i] for i, place in enumerate(self._named)}
+        values = {place: noisy[i] for i, place in enumerate(self.named)}
         bound = self._with(values)
-        bound.decision, bound._named, bound._varying = OWN, (), self._named
+        bound.decision, bound.named, bound._varying = OWN, (), self.named
         bound.__dict__["dim"] = self._scene_theta0.size
         own = xp.asarray(self._scene_theta0[:, None], dtype=noisy.dtype) + 0.0 * noisy[0]
         return bound, own
@@ -300,7 +299,7 @@ class FunctionProgram(Program):
     def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
         """Return the scene's cost at theta + sigma w, ``(B,)``; the scene's own noise follows the first d rows of w."""
         w, own_noise = (w[: self.dim], [w[self.dim :]]) if self.exogenous else (w, [])
-        bound, own = self._own_theta(ops.xp, theta, w) if self._named else (self, theta + self.scene.sigma * w)
+        bound, own = self._own_theta(ops.xp, theta, w) if self.named else (self, theta + self.scene.sigma * w)
         assert isinstance(bound.scene, FunctionScene)
         return bound.scene.cost(ops.xp, own, *own_noise)
 
@@ -326,8 +325,10 @@ class Rollout(Program):
     @property
     def noise_on_theta(self) -> bool:
         """Whether noise is on theta: parameter noise, or action noise if theta is only the sequence of controls."""
-        plans_controls = self.scene.open_loop and self._only_controls and not self._moves_start
-        return not self.action_noise or plans_controls
+        # the default control law without feedback: u_t = theta_t + sigma w_t if open-loop
+        scene, laws = type(self.scene), ("planned_controls", "feedback")
+        is_default = all(getattr(scene, law) is getattr(MechanicalScene, law) for law in laws)
+        return not self.action_noise or (scene.open_loop and is_default and not self._moves_start)
 
     @property
     def is_open_loop(self) -> bool:
@@ -344,12 +345,6 @@ class Rollout(Program):
             f"theta sets the initial state of scene {self.scene.name} while noise is on the actions, so that cost times "
             "score is not the gradient: use noise=parameter"
         )
-
-    @property
-    def _only_controls(self) -> bool:
-        """Whether the scene uses the default control law, without feedback: u_t = theta_t + sigma w_t if open-loop."""
-        scene = type(self.scene)
-        return all(getattr(scene, law) is getattr(MechanicalScene, law) for law in ("planned_controls", "feedback"))
 
     @cached_property
     def _moves_start(self) -> bool:
@@ -386,7 +381,7 @@ class Rollout(Program):
 
     def resolved(self, ops: Ops, theta: Array, w: Array) -> tuple[Rollout, Array, Array]:
         """Return program, theta and noise with the named parameters set from theta; unchanged if none are named."""
-        if not self._named:
+        if not self.named:
             return self, theta, w
         bound, own = self._own_theta(ops.xp, theta, w[: self.dim])
         assert isinstance(bound, Rollout)
@@ -489,10 +484,6 @@ class _VaryingOps(Ops):
     def __init__(self, ops: Ops, places: list[tuple[Plugin, str]]) -> None:
         super().__init__(ops.xp)
         self._ops, self._places = ops, places
-
-    def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """Return the last carry of the backend's ``scan``."""
-        return self._ops.scan(step, carry, xs, length)
 
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
         """Return the backend's ``root``, with the parameter values passed as additional arguments."""

@@ -12,7 +12,6 @@ import pandas as pd
 
 from bench.errors import UserError, printable, unknown
 from bench.experiment.experiment import Experiment
-from bench.experiment.study import study_of
 from bench.experiment.views import Views
 from bench.host import guard
 from bench.report import answer, generic, ladder, reproduce, writer
@@ -66,7 +65,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> tuple[Views, list[Path]
 def views_of(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return what the study shows of its rows, or else a table of its numbers and a chart of the first."""
     rows = rows.reset_index(drop=True)
-    views = study_of(experiment).views(experiment, rows) or generic.views(experiment, rows)
+    views = experiment.study.views(experiment, rows) or generic.views(experiment, rows)
     if experiment.execution.ladder:
         views = replace(views, tables=[ladder.table(experiment, rows), *views.tables])
     if not rows["status"].isin(RESULTS).any():

@@ -6,7 +6,6 @@ import pandas as pd
 
 from bench.experiment.columns import text
 from bench.experiment.experiment import Experiment
-from bench.experiment.study import study_of
 from bench.experiment.views import Table
 from bench.run.ladder import fault_of
 
@@ -19,7 +18,7 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> Table:
     for backend, part in rows.groupby("backend", sort=False):
         failed = False
         for rung in dict.fromkeys(part["scene"]):
-            reason = "" if failed else fault_of(study_of(experiment), part[part["scene"] == rung])
+            reason = "" if failed else fault_of(experiment.study, part[part["scene"] == rung])
             verdict = "not started" if failed else "failed" if reason else "passed"
             lines.append((backend, rung, verdict, reason))
             failed = failed or bool(reason)

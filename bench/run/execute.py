@@ -19,11 +19,11 @@ from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
 from bench.experiment.keys import HASHED
 from bench.experiment.parameters import completed_rows
-from bench.experiment.study import study_of
 from bench.host import guard, reads
 from bench.measure import timing
+from bench.measure.descent import DescentPath
 from bench.model import Estimator
-from bench.run import descents, progress
+from bench.run import progress
 from bench.run.files import remove_stale
 from bench.run.ladder import climb
 from bench.run.launchers import Launcher, launcher_of
@@ -31,6 +31,7 @@ from bench.run.plan import Planned, plan
 from bench.run.pool import TaskResult
 from bench.run.record import kind_of_machine
 from bench.run.session import RunSession
+from bench.run.shared import Shared
 from bench.run.store import Store, sort_rows
 from bench.run.tasks import FAILED, Task, group_by_program, result_of, row_of
 
@@ -66,10 +67,9 @@ def store_of(experiment: Experiment) -> Store:
 def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     """Run the missing cells of an experiment and merge their rows into ``rows.parquet``.
 
-    Cells whose rows are gone at the end, for example since the results folder was renamed or removed, are run again.
-    Raises :class:`Stopped` after a failed cell in an experiment with ``on_error=stop`` and if rows are missing
-    even so, KeyboardInterrupt if interrupted (every cell finished by then is stored), and :class:`UserError` if the study
-    supports no cell.
+    Raises :class:`Stopped` after a failed cell in an experiment with ``on_error=stop``, and where rows are gone at the end
+    since the results folder was renamed or removed, KeyboardInterrupt if interrupted (every cell finished by then is stored),
+    and :class:`UserError` if the study supports no cell.
     """
     started = time.time()
     # measured before the run itself loads the machine
@@ -77,28 +77,14 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     store = store_of(experiment)
     planned = plan(experiment, store)
     _refuse_without_supported_cells(experiment, planned)
-    progress.print_versions(planned, experiment.execution.versions)
-    progress.print_machines(planned)
-    progress.print_stale(planned)
+    progress.print_states(planned, experiment.execution.versions)
     store.prepare()
     for folder in (experiment.directory, experiment.directory / "pending", experiment.results_dir / "references"):
         remove_stale(folder)
     _run(experiment, planned, store, quiet)
-    # cells whose rows are gone at the end of a run are run again, at most twice
-    for is_last in (False, False, True):
-        stored = set(store.load()["key"])
-        rest = [replace(item, stored=item.cell.key in stored) for item in planned]
-        if all(item.stored for item in rest):
-            break
-        missing = sum(not item.stored for item in rest)
-        if is_last:
-            raise Stopped(f"since {missing} cells were run and have no row")
-        print(
-            f"bench: {missing} of {len(planned)} cells were run and have no row in '{store.directory}': was it renamed or "
-            "removed? They are run again",
-            file=sys.stderr,
-        )
-        _run(experiment, rest, store, quiet)
+    stored = set(store.load()["key"])
+    if missing := len({item.cell.key for item in planned} - stored):
+        raise Stopped(f"since {missing} cells were run and have no row: was '{store.directory}' renamed or removed?")
     progress.print_others(experiment, planned, stored)
     return Finished(experiment, store, planned, time.time() - started)
 
@@ -119,9 +105,8 @@ def _refuse_without_supported_cells(experiment: Experiment, planned: Sequence[Pl
     """Raise :class:`UserError` with the reasons if the study supports no cell of the experiment."""
     if any(item.refusal is None for item in planned):
         return
-    study = study_of(experiment)
     try:
-        reasons = dict.fromkeys(study.refusal(item.cell) for item in planned)
+        reasons = dict.fromkeys(experiment.study.refusal(item.cell) for item in planned)
     except (Unsupported, UserError):
         return  # a cell without a program reports the reason in its row
     if reasons and None not in reasons:
@@ -154,8 +139,6 @@ class Runner:
     shown: progress.Progress
     read: dict[str, str] = field(default_factory=lambda: {reads.name_of(path): of for path, of in HASHED.items()})
     """Hashes of what code from outside has read in this run, by name."""
-    unchanged: set[str] = field(default_factory=lambda: {""})
-    """The texts in which answers give these hashes."""
 
     def run(self, planned: Sequence[Planned]) -> None:
         """Store a row for every cell that has none.
@@ -184,19 +167,21 @@ class Runner:
         A descent is computed once, stored, and shared by all cells of its scene.
         """
         starts = {cell.path.descent_key: cell.path for cell in cells if cell.path is not None}
-        folder = self.experiment.results_dir.absolute() / "references"
-        known = {key: descents.load(folder, key) for key in starts}
-        due = [start.with_part("backend", start.descent_backend) for key, start in starts.items() if known[key] is None]
-        failed: dict[str, dict[str, Any]] = {}
+        shared, known, failed = Shared(self.experiment), dict[str, DescentPath](), dict[str, dict[str, Any]]()
+        for key in starts:
+            with suppress(TypeError):  # none is stored, or it is no path
+                known[key] = DescentPath(**(shared.load(f"descent_{key}") or {}))
+        due = [start.with_part("backend", start.descent_backend) for key, start in starts.items() if key not in known]
         if due:
             with launcher_of(self.experiment) as launcher:
-                tasks = [Task(start, descent=True) for start in due]
-                for answer in itertools.chain.from_iterable(self._answers(tasks, launcher)):
+                answers = itertools.chain.from_iterable(
+                    self._answers([Task(start, "descent") for start in due], launcher)
+                )
+                for answer in answers:
                     key = answer.item.cell.descent_key
                     if answer.result["status"] == "ok":
-                        known[key] = descents.save(
-                            folder, key, answer.result["descent"], answer.result.get("reads", "")
-                        )
+                        known[key] = DescentPath(**answer.result["descent"])
+                        shared.save(f"descent_{key}", answer.result["descent"], answer.result.get("reads", ""))
                     else:
                         failed[key] = result_of(answer, "its descent: ")
         placed: list[Cell] = []
@@ -204,24 +189,26 @@ class Runner:
             key = "" if cell.path is None else cell.path.descent_key
             if not key:
                 placed.append(cell)
-            elif (found := known[key]) is not None and not found.reason:
-                placed.append(replace(cell, point=found.at(cell.decision.descent)))
+            elif key in failed:
+                self._finish([(cell, failed[key])])
+            elif known[key].reason:
+                reason = {"status": "unsupported", "reason": f"no descent: {known[key].reason}"}
+                self._finish([(cell, reason | {"machine": kind_of_machine()})])
             else:
-                reason = {"status": "unsupported", "reason": f"no descent: {found.reason if found else ''}"}
-                self._finish([(cell, failed.get(key, reason | {"machine": kind_of_machine()}))])
+                placed.append(replace(cell, point=known[key].at(cell.decision.descent)))
         return placed
 
     def _compute_references(self, cells: list[Cell], references: list[Cell], launcher: Launcher) -> list[Cell]:
         """Compute references and return the cells to measure; cells whose reference failed are stored with its status."""
-        tasks = [Task(_for_reference(cell), reference=True) for cell in references]
-        failed: dict[str, dict[str, Any]] = {}
-        for answer in itertools.chain.from_iterable(self._answers(tasks, launcher)):
-            if answer.result["status"] != "ok":
-                failed[answer.item.cell.reference_key] = result_of(answer, "its reference gradient: ")
-        if not failed:
-            return cells
-        self._finish([(cell, failed[cell.reference_key]) for cell in cells if cell.reference_key in failed])
-        return [cell for cell in cells if cell.reference_key not in failed]
+        tasks = [Task(_for_reference(cell), "reference") for cell in references]
+        failed = {
+            answer.item.cell.reference_key: result_of(answer, "its reference gradient: ")
+            for answer in itertools.chain.from_iterable(self._answers(tasks, launcher))
+            if answer.result["status"] != "ok"
+        }
+        lost = {cell.key for cell in cells if cell.budget is not None and cell.reference_key in failed}
+        self._finish([(cell, failed[cell.reference_key]) for cell in cells if cell.key in lost])
+        return [cell for cell in cells if cell.key not in lost]
 
     def _measure(self, cells: list[Cell], launcher: Launcher) -> None:
         for answers in self._answers([Task(cell) for cell in cells], launcher):
@@ -234,26 +221,21 @@ class Runner:
         for answers in launcher.run(groups):
             guard.raise_pending_interrupt()
             n_done += len(answers)
-            current_answers = [*itertools.takewhile(lambda answer: not self._changed(answer), answers)]
-            if current_answers:
-                yield current_answers
-            if changed := next(filter(None, map(self._changed, answers[len(current_answers) :])), ""):
-                raise Stopped(f"since {changed} changed during the run")
+            good = [*itertools.takewhile(lambda answer: not self._changed(answer), answers)]
+            if good:
+                yield good
+            if len(good) < len(answers):
+                raise Stopped(f"since {self._changed(answers[len(good)])} changed during the run")
             current = "; ".join(str(item) for item in launcher.current)
-            if what := "references" * tasks[0].reference or "descents" * tasks[0].descent:
+            if what := tasks[0].kind:
                 # these are no cells, so the counts of cells stand still meanwhile
-                current += f" ({n_done} of {len(tasks)} {what} done)"
+                current += f" ({n_done} of {len(tasks)} {what}s done)"
             self.shown.working(current)
 
     def _changed(self, answer: TaskResult) -> str:
         """Return what had another content when the cells were planned or an earlier one ran; empty if there is nothing."""
-        if (text := answer.result.get("reads", "")) in self.unchanged:
-            return ""
-        for name, content in json.loads(text).items():
-            if self.read.setdefault(name, content) != content:
-                return str(name)
-        self.unchanged.add(text)
-        return ""
+        read = json.loads(answer.result.get("reads") or "{}")
+        return next((name for name, content in read.items() if self.read.setdefault(name, content) != content), "")
 
     def _finish(self, results: list[tuple[Cell, dict[str, Any]]]) -> None:
         """Store rows and report them; raises :class:`Stopped` if due."""
@@ -265,16 +247,12 @@ class Runner:
         if self.experiment.execution.stop:
             for row in rows:
                 if row["status"] in FAILED:
-                    raise _stopped_by(row)
+                    names = " ".join(str(row[name]) for name in ("scene", "backend", "estimator") if row.get(name))
+                    raise Stopped(f"after a failed cell ({names}: {row['status']}, {row['reason']})")
 
 
 class Stopped(Exception):
     """Raised when a run ends before its last cell: a cell failed in a run with ``on_error=stop``, or rows are missing."""
-
-
-def _stopped_by(row: dict[str, Any]) -> Stopped:
-    names = " ".join(str(row[name]) for name in ("scene", "backend", "estimator") if row.get(name))
-    return Stopped(f"after a failed cell ({names}: {row['status']}, {row['reason']})")
 
 
 def _for_reference(cell: Cell) -> Cell:

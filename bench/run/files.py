@@ -13,9 +13,6 @@ from pathlib import Path
 
 from bench.errors import StorageError
 
-TEMPORARY = re.compile(r"\..+-bench-[0-9a-f]{32}")
-"""Names of files being written."""
-
 
 def remove_stale(directory: Path) -> None:
     """Remove the half-written files of killed runs from a directory, but not from its subdirectories."""
@@ -23,7 +20,7 @@ def remove_stale(directory: Path) -> None:
         for path in directory.iterdir():
             with suppress(OSError):
                 # age in seconds after which a half-written file is that of a killed run
-                if TEMPORARY.fullmatch(path.name) and time.time() - path.stat().st_mtime > 3600.0:
+                if re.fullmatch(r"\..+-bench-[0-9a-f]{32}", path.name) and time.time() - path.stat().st_mtime > 3600.0:
                     path.unlink()
 
 
@@ -38,7 +35,12 @@ def write_whole(path: Path, content: bytes | Iterable[bytes]) -> None:
             # the content must be on disk before the name points to it, or a power cut leaves an empty file
             flush_to_disk(file.fileno())
         os.replace(part, path)
-        sync_directory(path.parent)
+        # the entries of the folder too, so that the name survives a power failure
+        descriptor = os.open(path.parent, os.O_RDONLY)
+        try:
+            flush_to_disk(descriptor)
+        finally:
+            os.close(descriptor)
     except BaseException as error:  # also of code that makes the content
         with suppress(OSError):
             part.unlink(missing_ok=True)
@@ -65,15 +67,6 @@ def make_directory(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StorageError(f"'{path}' cannot be written: {error.strerror}") from None
-
-
-def sync_directory(directory: Path) -> None:
-    """Write the entries of a directory to disk, so that renames survive a power failure."""
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        flush_to_disk(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def flush_to_disk(descriptor: int) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from bench.errors import printable
 from bench.experiment.experiment import Experiment
-from bench.experiment.study import Study, study_of
+from bench.experiment.study import Study
 from bench.run.plan import Planned
 from bench.run.store import Store
 
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 WAITING = "waiting"
 """Status of a cell that waits for a rung below it."""
-UNCHECKED = ("unsupported", "unavailable", WAITING)
-"""Statuses of cells that were not run."""
 
 
 def climb(
@@ -46,7 +44,7 @@ def climb(
         for backend, part in rows.groupby("backend", sort=False):
             if backend in stops:
                 continue
-            fault = fault_of(study_of(experiment), part)
+            fault = fault_of(experiment.study, part)
             if fault:
                 stops[str(backend)] = f"the rung below ({name}) did not pass: {fault}"
             verdict = f"did not pass: {fault}" if fault else "passed"
@@ -66,7 +64,7 @@ def fault_of(study: Study, rows: pd.DataFrame) -> str:
 
     They pass if at least one cell was checked, no cell failed, and the study finds no :meth:`~Study.failure`.
     """
-    checked = rows[~rows["status"].isin(UNCHECKED)]
+    checked = rows[~rows["status"].isin(("unsupported", "unavailable", WAITING))]
     if checked.empty:
         return f"no cell could be checked ({', '.join(dict.fromkeys(map(printable, rows['reason'])))})"
     failed = checked[checked["status"] != "ok"]

@@ -14,8 +14,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from bench.experiment.experiment import Experiment
-from bench.experiment.study import study_of
-from bench.run.pool import BATCH_S, Pool, ResourceLimits, TaskResult
+from bench.run.pool import BATCH_S, Pool, TaskResult
 from bench.run.tasks import FAILED, Task, TaskHandler
 
 
@@ -71,8 +70,7 @@ def launcher_of(experiment: Experiment, timed: bool = False) -> Launcher:
     workers = (os.cpu_count() or 1) if rules.workers is None else rules.workers
     if not workers:
         return InProcessLauncher(TaskHandler(experiment, single_thread=not timed))
-    limits = ResourceLimits(rules.timeout, rules.memory)
     return Pool(
-        1 if timed else workers, TaskHandler, replace(experiment, choices={}, values={}, sweep={}, also=(), marks={}), limits,
-        single_thread=not timed or study_of(experiment).fresh_process, folders=experiment.plugins, outside=lambda task: task.outside,
+        1 if timed else workers, TaskHandler, replace(experiment, choices={}, values={}, sweep={}, also=(), marks={}), rules,
+        single_thread=not timed or experiment.study.fresh_process, folders=experiment.plugins, outside=lambda task: task.outside,
     )  # fmt: skip

@@ -13,7 +13,6 @@ from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
 from bench.experiment.grid import COUNTS, cells
 from bench.experiment.parameters import completed_json
-from bench.experiment.study import study_of
 from bench.host import guard, reads
 from bench.host.parameters import remember
 from bench.model import Backend, Plugin, registry
@@ -22,10 +21,6 @@ from bench.run.store import Store
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-Identity = tuple[str, float, float, float]
-"""The identity of a cell apart from its code: completed parameters as JSON, samples, repeats and seed."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +69,7 @@ def _is_in_shard(cell: Cell, shard: tuple[int, int] | None) -> bool:
 
 def _planned(experiment: Experiment, cell: Cell, stored: dict[str, tuple[str, ...]], present: reads.Present) -> Planned:
     refusal = cell.refusal()
-    if refusal is None and (reason := study_of(experiment).refusal(cell)) is not None:
+    if refusal is None and (reason := experiment.study.refusal(cell)) is not None:
         refusal = ("unsupported", reason)
     if cell.key not in stored:
         return Planned(cell, False, refusal)
@@ -104,7 +99,11 @@ def requested_rows(experiment: Experiment, rows: pd.DataFrame) -> tuple[pd.DataF
             keys = {cell.key for cell in every}
             is_requested = rows["key"].isin(keys).to_numpy(copy=True)
             others = rows.loc[~is_requested, ["parameters", *COUNTS]]
-            identities = {_identity_of(cell) for cell in every} if len(others) else set()
+            identities = {
+                (completed_json(json.dumps(cell.parameters)), *(getattr(cell, name) for name in COUNTS))
+                for cell in every
+                if len(others)
+            }
     except UserError:
         return rows, ""  # a plugin of the rows may not be installed any more
     facts = zip(others["parameters"].map(completed_json), *(others[name] for name in COUNTS), strict=True)
@@ -121,11 +120,6 @@ def requested_rows(experiment: Experiment, rows: pd.DataFrame) -> tuple[pd.DataF
     hidden = f"{n_others} stored rows of other settings are not shown" if n_others else ""
     shown = rows[is_requested].reset_index(drop=True) if n_others else rows
     return shown, "; ".join(part for part in (missing, hidden) if part)
-
-
-def _identity_of(cell: Cell) -> Identity:
-    parameters = json.dumps(cell.parameters, separators=(",", ":"))
-    return completed_json(parameters), float(cell.samples), float(cell.repeats), float(cell.seed)
 
 
 def expected_seconds(runs: Sequence[Planned], rows: pd.DataFrame) -> float:

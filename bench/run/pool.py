@@ -28,42 +28,22 @@ from typing import IO, Any, Literal
 import psutil
 
 from bench.errors import STATUSES, StorageError, UserError, describe_exit, failure
+from bench.experiment.experiment import Execution
 from bench.host import guard
 from bench.model import registry
 from bench.run.reaper import MARK, Reaper, kill_marked_processes
 from bench.run.worker import Handler, command
 
-TICK = 0.05
-"""Seconds between checks of the items' time and memory."""
 BATCH_S = 0.05
 """Seconds for which the answers of quick items are gathered, to be stored in one file: syncing takes longer than a small cell."""
-STEAL_S = 5.0
-"""Seconds of queued work above which an idle worker takes half of a queue, although it has to compile again."""
 TAIL, MOST_OUTPUT = 16000, 1 << 26
 """Bytes that are read of the end of a worker's printed output, and bytes of a file of output that is emptied."""
 EXIT_S = 5.0
 """Seconds allowed for the rest of a message to arrive, and for a process to end after it has closed its connection."""
-MAX_MESSAGE = 1 << 30
-"""Bytes of the longest valid message."""
 LOST = "closed its connection"
 """The fault of a worker that has ended."""
-SINGLE_THREAD = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "NPROC": "1",
-}
-"""Environment variables that limit numerical libraries to one thread, if set before the libraries are imported."""
-
-
-@dataclass(frozen=True)
-class ResourceLimits:
-    """Limits of one item; None for no limit."""
-
-    timeout: float | None = None
-    """Seconds."""
-    memory: int | None = None
-    """Bytes of resident memory, libraries included."""
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC")
+"""Environment variables that limit the threads of numerical libraries, if set before the libraries are imported."""
 
 
 @dataclass(frozen=True)
@@ -164,12 +144,12 @@ class _Worker:
         answers: list[TaskResult] = []
         try:
             while not self.fault and self.connection.poll():
-                answers += self._read(self.connection.recv_bytes(MAX_MESSAGE))
+                answers += self._read(self.connection.recv_bytes(1 << 30))
         except (EOFError, ConnectionError):
             self.fault = LOST
         except StorageError:
             raise
-        except Exception:  # no message, or it is too long, or its rest did not arrive
+        except Exception:  # no message, or it is longer than 1 GiB, or its rest did not arrive
             self.fault = "sent a malformed message"
         return answers
 
@@ -221,7 +201,8 @@ class _Worker:
 class Pool:
     """Workers that share groups of items: a context manager that ends all its processes on exit.
 
-    ``make(argument)`` builds the handler in each worker, with the plugins in ``folders`` available. With
+    ``make(argument)`` builds the handler in each worker, with the plugins in ``folders`` available.
+    ``limits`` has the seconds that an item may take, and the bytes of memory that it may use, libraries included. With
     ``single_thread``, numerical libraries use one thread. ``outside(item)`` are the modules from outside whose code an
     item runs, the same for all items of a group: a worker that has run such code only runs items with the same ones.
     """
@@ -231,7 +212,7 @@ class Pool:
         n_workers: int,
         make: Callable[[Any], Handler],
         argument: Any,
-        limits: ResourceLimits,
+        limits: Execution,
         single_thread: bool = True,
         folders: Sequence[Path] = (),
         outside: Callable[[Any], frozenset[str]] = lambda _: frozenset(),
@@ -256,7 +237,7 @@ class Pool:
             self._reaper = None
 
     def run(self, groups: Sequence[Sequence[Any]]) -> Iterator[list[TaskResult]]:
-        """Yield answers as they arrive, one per item, and an empty list if none arrive within :data:`TICK`.
+        """Yield answers as they arrive, one per item, and an empty list if none arrive within :data:`BATCH_S`.
 
         The items of a group go to one worker, in order, unless another worker is idle.
         """
@@ -312,12 +293,12 @@ class Pool:
         return not worker.outside or worker.outside == self._outside(group[0])
 
     def _take_half(self, idle: _Worker) -> deque[Any]:
-        """Remove and return the second half of the slowest queue; empty if that queue takes less than :data:`STEAL_S`."""
+        """Remove and return the second half of the slowest queue; empty if that queue takes less than 5 s: it compiles again."""
         longest = max(self._workers, key=lambda worker: len(worker.queue) * worker.pace)
         half: deque[Any] = deque()
         if longest.queue and not self._may_run(idle, longest.queue):
             return half
-        if len(longest.queue) * longest.pace > STEAL_S:
+        if len(longest.queue) * longest.pace > 5.0:
             for _ in range(len(longest.queue) // 2):
                 half.appendleft(longest.queue.pop())
         return half
@@ -333,7 +314,7 @@ class Pool:
         process = subprocess.Popen(
             command(theirs.fileno()), pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL,
             stdout=output, stderr=output, start_new_session=True,
-            env=registry.environment() | {MARK: mark} | (SINGLE_THREAD if self._single_thread else {}),
+            env=registry.environment() | {MARK: mark} | dict.fromkeys(THREADS if self._single_thread else (), "1"),
         )  # fmt: skip
         # a socket reports its end only when every copy of the other side is closed, including this copy
         theirs.close()
@@ -383,7 +364,8 @@ class Pool:
         if worker.is_done:
             return "done", "a plugin has changed its process"
         now = time.monotonic()
-        if not worker.fault and now < worker.checked + TICK:
+        # seconds between checks of the items' time and memory
+        if not worker.fault and now < worker.checked + 0.05:
             return None
         worker.checked, code = now, worker.process.poll()
         if code is None and worker.fault == LOST:

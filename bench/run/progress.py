@@ -22,10 +22,8 @@ if TYPE_CHECKING:
     import rich.console
     import rich.progress
 
-FIRST_LINE_S, LINE_S = 5.0, 10.0
-"""Seconds before the first line and between lines where the output is not a terminal."""
-NAME_WIDTH, BAR_WIDTH = 20, 16
-"""Most characters of the experiment's name, and characters of a bar."""
+LINE_S = 10.0
+"""Seconds between lines where the output is not a terminal; the first comes after half of them."""
 
 
 class Progress:
@@ -40,7 +38,7 @@ class Progress:
         self._failed: Counter[str] = Counter()
         self._n_due = sum(item.runs for item in planned)  # stored and refused cells take no time
         self._task = bars.add_task(printable(name), total=self._n_due, counts=self._counts(), current="")
-        self._printed_at = time.monotonic() + FIRST_LINE_S - LINE_S
+        self._printed_at = time.monotonic() - LINE_S / 2
         if lines and self._n_done:
             print(f"{name}: {self._n_done} of {self._n_cells} cells are stored", file=sys.stderr)
 
@@ -77,10 +75,10 @@ def bars_on(console: rich.console.Console, disable: bool = False) -> rich.progre
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
     from rich.table import Column
 
-    name = Column(no_wrap=True, overflow="ellipsis", max_width=NAME_WIDTH)
+    name = Column(no_wrap=True, overflow="ellipsis", max_width=20)
     current = Column(no_wrap=True, overflow="ellipsis", ratio=1)
     return Progress(
-        TextColumn("{task.description}", markup=False, table_column=name), BarColumn(BAR_WIDTH),
+        TextColumn("{task.description}", markup=False, table_column=name), BarColumn(16),
         TextColumn("{task.fields[counts]}", markup=False), TimeRemainingColumn(compact=True),
         TextColumn("{task.fields[current]}", markup=False, table_column=current),
         console=console, transient=True, expand=True, disable=disable,
@@ -98,33 +96,32 @@ def show_progress(name: str, planned: Sequence[Planned], quiet: bool = False) ->
         yield Progress(name, planned, bars, lines=not (shows_bar or quiet))
 
 
-def print_versions(planned: Sequence[Planned], policy: str) -> None:
-    """Print how many stored rows were computed with other library versions, and whether they are run again."""
-    counts = Counter(item.other_versions for item in planned if item.other_versions)
-    for versions, count in counts.most_common():
-        action = (
-            "they are run again" if policy == "rerun" else "versions=rerun runs them again, versions=ignore keeps quiet"
-        )
-        print(f"bench: {count} stored rows were made with {versions}: {action}", file=sys.stderr)
+def print_states(planned: Sequence[Planned], policy: str) -> None:
+    """Print how many stored rows are of other library versions or machines, or are run again since something has changed.
 
-
-def print_machines(planned: Sequence[Planned]) -> None:
-    """Print how many stored rows were timed on another kind of machine, if this run measures times here."""
-    this = record.kind_of_machine()
-    others = Counter(item.machine for item in planned if item.machine not in ("", this))
-    if others and any(item.runs and item.cell.timing for item in planned):
-        for machine, count in others.most_common():
-            print(
-                f"bench: {count} stored rows were timed on '{machine}', and this machine is '{this}': times of two kinds of "
-                "machine do not compare; choose another folder with name=..., or leave times out with timing=false",
-                file=sys.stderr,
-            )
+    ``policy`` says what happens with those of other versions. Machines count only if this run measures times here.
+    """
+    again = "they are run again" if policy == "rerun" else "versions=rerun runs them again, versions=ignore keeps quiet"
+    _print_counts((item.other_versions for item in planned), f"were made with {{}}: {again}")
+    if any(item.runs and item.cell.timing for item in planned):
+        this = record.kind_of_machine()
+        others = (item.machine for item in planned if item.machine != this)
+        _print_counts(
+            others, f"were timed on '{{}}', and this machine is '{this}': times of two kinds of machine do not compare; choose "
+            "another folder with name=..., or leave times out with timing=false",
+        )  # fmt: skip
+    print_stale(planned)
 
 
 def print_stale(planned: Sequence[Planned]) -> None:
     """Print how many stored rows are run again since something that they have read has changed."""
-    for stale, count in Counter(item.stale for item in planned if item.stale).most_common():
-        print(f"bench: {count} stored rows are stale, and run again: {printable(stale)}", file=sys.stderr)
+    _print_counts((printable(item.stale) for item in planned), "are stale, and run again: {}")
+
+
+def _print_counts(values: Iterable[str], text: str) -> None:
+    """Print how many stored rows have each value that is not empty."""
+    for value, count in Counter(filter(None, values)).most_common():
+        print(f"bench: {count} stored rows {text.format(value)}", file=sys.stderr)
 
 
 def print_others(experiment: Experiment, planned: Sequence[Planned], keys: Iterable[str]) -> None:

@@ -21,8 +21,8 @@ from contextlib import suppress
 
 MARK = "BENCH_MARK"
 """Environment variable that marks a process and every process that it starts, even in another session."""
-PASSES, PAUSE_S = 5, 0.2
-"""Most searches for marked processes, which may start others meanwhile, and the reaper's pause in seconds after each."""
+PASSES = 5
+"""Most searches for marked processes, which may start others meanwhile."""
 
 
 class Reaper:
@@ -95,7 +95,7 @@ def main() -> None:
             with suppress(Exception):  # it has ended
                 if process.pid != os.getpid():
                     process.kill()  # psutil spares a later process of the same id
-        time.sleep(PAUSE_S)
+        time.sleep(0.2)
 
 
 def kill_marked_processes(mark: str) -> int:

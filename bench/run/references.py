@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import replace
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,15 +14,10 @@ from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
 from bench.experiment.keys import fingerprint, hash_of_text
 from bench.experiment.session import Problems
-from bench.host import reads
 from bench.measure import reference, smoothed
 from bench.measure.reference import Reference
-from bench.model import Backend, Problem, registry
-from bench.run.files import make_directory, write_whole
-from bench.run.rows import read_parquet
-
-SCALARS = ("method", "error", "note", "spacing", "samples")
-"""Fields of a reference that are one value."""
+from bench.model import Backend, Problem
+from bench.run.shared import Shared
 
 
 class References:
@@ -31,47 +25,47 @@ class References:
 
     def __init__(self, experiment: Experiment, problems: Problems) -> None:
         self._problems = problems
-        # absolute, since a plugin may change the working folder
-        self._directory = experiment.results_dir.absolute() / "references"
+        self._shared = Shared(experiment)
         self._budget = experiment.reference
         self._references: dict[str, Reference] = {}
-        self._present = reads.Present(registry.environment())
         self.stores = True
         """Whether computed references are stored for other cells."""
 
     def stored(self, cell: Cell) -> bool:
         """Return whether the reference of the cell's program is on disk, and all that it has read is unchanged."""
-        return self._load(self._path(cell)) is not None
+        return self._load(cell.reference_key) is not None
 
-    def _load(self, path: Path) -> Reference | None:
-        result, read = load(path), read_by(path)
-        if result is None or self._present.change(read):
-            return None
-        reads.include(read)
-        return result
+    def _load(self, key: str) -> Reference | None:
+        found: dict[str, Any] = self._shared.load(key) or {}
+        with suppress(TypeError, ValueError):  # it is no reference
+            lists = {
+                name: np.array(value, dtype=np.float64) for name, value in found.items() if isinstance(value, list)
+            }
+            return Reference(**{**found, **lists})
+        return None
 
     def of(self, cell: Cell) -> Reference:
         """Return the reference of the cell's program, from the best backend that can run it, in arrays of the caller's own.
 
         Where costs of the cell's own backend differ from those of that one, the cell's backend computes its own.
         """
-        shared = self._known(self._path(cell), lambda: self._compute(cell))
+        shared = self._known(cell.reference_key, lambda: self._compute(cell))
         own = fingerprint(cell.backend)
         if own == fingerprint(cell.reference_backends[0]) or shared.method == "closed_form":
             return deepcopy(shared)
-        path = self._path(cell, f"-{hash_of_text(own)}")
-        return deepcopy(self._known(path, lambda: self._for_backend(shared, cell)))
+        key = f"{cell.reference_key}-{hash_of_text(own)}"
+        return deepcopy(self._known(key, lambda: self._for_backend(shared, cell)))
 
-    def _known(self, path: Path, compute: Callable[[], Reference]) -> Reference:
-        """Return the reference of a path, loaded or computed at first use."""
-        if path.name not in self._references:
-            result = self._load(path)
+    def _known(self, key: str, compute: Callable[[], Reference]) -> Reference:
+        """Return the reference of a key, loaded or computed at first use."""
+        if key not in self._references:
+            result = self._load(key)
             if result is None:
                 result = compute()
                 if self.stores:
-                    save(result, path, reads.manifest())
-            self._references[path.name] = result
-        return self._references[path.name]
+                    self._shared.save(key, vars(result))
+            self._references[key] = result
+        return self._references[key]
 
     def _compute(self, cell: Cell) -> Reference:
         """Compute the reference on the first backend that can; raises the error of the first backend if none can.
@@ -129,9 +123,6 @@ class References:
         result = reference.certify(problem, backend.provides, *budget, points=self._budget.points)
         return replace(result, method=f"gaussian[radius={smoothing.radius:g}],{result.method}")
 
-    def _path(self, cell: Cell, backend: str = "") -> Path:
-        return self._directory / f"{cell.reference_key}{backend}.parquet"
-
     def _physical_gradient(self, cell: Cell) -> np.ndarray | None:
         """Return the exact gradient at w = 0 that the program's gradient approximates, shape (d,); None if unknown.
 
@@ -143,46 +134,6 @@ class References:
         if physical is None and "physics" in cell.backend.provides:
             for backend in cell.ranked_backends:
                 if "grad" in backend.provides:
-                    no_noise = np.zeros((program.n_noise, 1))
                     with suppress(Exception):  # if a backend cannot run the program, the next one is used
-                        return self._problems.of(backend, cell).grad(program.theta0, no_noise)[:, 0]
+                        return self._problems.of(backend, cell).grad()
         return physical
-
-
-def save(reference: Reference, path: Path, read: str = "") -> None:
-    """Store a reference as Parquet, with what code from outside has read."""
-    import pandas as pd
-
-    rows = [("batch", row) for row in reference.batches]
-    rows += [
-        (name, value) for name, value in (("plain", reference.plain), ("physical", reference.physical)) if value.size
-    ]
-    table = pd.DataFrame(
-        {"part": [name for name, _ in rows], "gradient": [list(row) for _, row in rows],
-         **{name: getattr(reference, name) for name in SCALARS}, "reads": read}
-    )  # fmt: skip
-    buffer = io.BytesIO()
-    table.to_parquet(buffer, index=False)
-    make_directory(path.parent)
-    write_whole(path, buffer.getvalue())
-
-
-def load(path: Path) -> Reference | None:
-    """Load a stored reference; returns None if the file is missing or unreadable."""
-    if not path.is_file():
-        return None
-    try:
-        table = read_parquet(path)
-        # a file has None for NaN
-        rows = {name: np.array([*part], dtype=np.float64) for name, part in table.groupby("part")["gradient"]}
-        vectors = {name: rows[name][0] for name in ("plain", "physical") if name in rows}
-        return Reference(rows["batch"], **vectors, **table.loc[0, list(SCALARS)])
-    except Exception:
-        return None
-
-
-def read_by(path: Path) -> str:
-    """Return what code from outside has read for a stored reference; empty if the file does not say."""
-    with suppress(Exception):
-        return str(read_parquet(path, ["reads"])["reads"][0])
-    return ""

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 MAX_ROWS = 5_000_000
 """Largest number of rows of a file: five times the largest sweep."""
-MAX_BYTES, MAX_GROWTH, ALWAYS_BYTES = 1 << 33, 500, 1 << 28
-"""Largest size of a table in memory; also as a multiple of the file's size, above 256 MiB."""
+ALWAYS_BYTES = 1 << 28
+"""Size in memory that every table may have."""
 MAX_TEXT = 1_000_000
 """Length of the longest string, in characters."""
 COUNTS = {"samples": 1, "repeats": 1, "seed": 0, "horizon": 0}
@@ -70,7 +70,7 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFra
     groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
     n_values = sum(group.column(i).num_values for group in groups for i in range(group.num_columns))
     size = max(sum(group.total_byte_size for group in groups), 8 * n_values)  # equal values take no room in a file
-    most = min(MAX_BYTES, max(ALWAYS_BYTES, MAX_GROWTH * content.getbuffer().nbytes))
+    most = min(1 << 33, max(ALWAYS_BYTES, 500 * content.getbuffer().nbytes))
     if metadata.num_rows > MAX_ROWS or size > most:
         raise ValueError(f"{metadata.num_rows} rows and {size} bytes are more than a run writes")
     leaves = [metadata.schema.column(i) for i in range(metadata.num_columns)]
@@ -226,7 +226,7 @@ def _parses(text: str) -> bool:
     if not text:
         return True
     try:
-        content = json.loads(text, parse_constant=_refuse)
+        content = json.loads(text, parse_constant=int)  # which refuses NaN
     except (ValueError, RecursionError):
         return False
     return isinstance(content, dict) and all(_is_part(axis, part) for axis, part in content.items())
@@ -236,7 +236,9 @@ def _is_part(axis: str, part: Any) -> bool:
     """Return whether an entry of a row's parameters is a plugin with its values, theta, the reference's budget, or null."""
     if part is None:
         return True
-    if not isinstance(part, dict) or not all(_is_value(value) for value in part.values()):
+    if not isinstance(part, dict):
+        return False
+    if not all(_is_scalar(value) or (isinstance(value, list) and _is_list(value)) for value in part.values()):
         return False
     if axis == "theta":
         at = part.get("at")
@@ -246,10 +248,6 @@ def _is_part(axis: str, part: Any) -> bool:
     return axis == "reference" or isinstance(part.get("name"), str)
 
 
-def _is_value(value: Any) -> bool:
-    return _is_scalar(value) or (isinstance(value, list) and _is_list(value))
-
-
 def _is_number(value: Any) -> bool:
     """Return whether a value is a number that float64 can hold."""
     return isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**1024)
@@ -257,10 +255,6 @@ def _is_number(value: Any) -> bool:
 
 def _is_missing(value: Any) -> bool:
     return value is None or (isinstance(value, float) and math.isnan(value))
-
-
-def _refuse(name: str) -> Any:
-    raise ValueError(f"{name} is not JSON")
 
 
 def read_record(folder: Path) -> dict[str, Any]:

@@ -20,7 +20,7 @@ import random
 import sys
 import time
 import uuid
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,15 +28,13 @@ from typing import TYPE_CHECKING, Any
 from bench.errors import StorageError, UserError, printable
 from bench.experiment.columns import Columns
 from bench.run.files import make_directory, write_whole
-from bench.run.rows import read_small, read_table
+from bench.run.rows import LARGEST, read_small, read_table
 
 if TYPE_CHECKING:
     import pandas as pd
 
 PATIENCE_S = 60.0
 """Seconds for which a merge is waited for, and reads are retried while other runs merge files."""
-MAX_SEQUENCE = 2.0**53
-"""Larger counts are not exact as float64, so no run has written them."""
 
 
 class Store:
@@ -148,28 +146,24 @@ class Store:
         return [path for name in names if (path := self._pending / name).is_file()]
 
     def _newest(self, frames: list[pd.DataFrame]) -> pd.DataFrame:
-        """Return the newest row of each key, and note the largest ``sequence`` for :meth:`append`."""
+        """Return the newest row of each key, and note the largest ``sequence`` for :meth:`append`; refuses rows of other studies."""
         import pandas as pd
 
         self._sequence = self._sequence or 0
         if not frames:
             return pd.DataFrame(columns=self._columns.stored)
         table = pd.concat(frames, ignore_index=True) if len(frames) > 1 else frames[0].reset_index(drop=True)
-        self._refuse_other_studies(table["study"])
-        sequence = table["sequence"].where(table["sequence"].between(0, MAX_SEQUENCE), 0.0)
-        self._sequence = max(self._sequence, int(sequence.max()))
-        newest_last = sequence.sort_values(kind="stable").index
-        is_older = table["key"].loc[newest_last].duplicated(keep="last").sort_index()
-        return table[~is_older].reset_index(drop=True) if is_older.any() else table
-
-    def _refuse_other_studies(self, studies: Iterable[str]) -> None:
-        """Raise :class:`UserError` if ``studies`` contains another study than this store's."""
-        others = sorted(set(studies) - {"", self._study}) if self._study else []
+        others = sorted({*table["study"]} - {"", self._study}) if self._study else []
         if others:
             raise UserError(
                 f"'{self.directory}' holds rows of study {', '.join(map(printable, others))}, and this is study {self._study}: "
                 "choose another folder with name=..."
             )
+        sequence = table["sequence"].where(table["sequence"].between(0, LARGEST), 0.0)
+        self._sequence = max(self._sequence, int(sequence.max()))
+        newest_last = sequence.sort_values(kind="stable").index
+        is_older = table["key"].loc[newest_last].duplicated(keep="last").sort_index()
+        return table[~is_older].reset_index(drop=True) if is_older.any() else table
 
 
 def sort_rows(table: pd.DataFrame, keys: Sequence[str]) -> pd.DataFrame:

@@ -9,14 +9,14 @@ from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 from bench.errors import STATUSES, StorageError, failure, printable
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
 from bench.experiment.keys import fingerprint, names_files
 from bench.experiment.parameters import PROBLEM
-from bench.experiment.study import Study, study_of
+from bench.experiment.study import Study
 from bench.host import guard, isolation, reads
 from bench.measure import descent, noise
 from bench.measure.statistics import PHYSICS
@@ -41,19 +41,17 @@ class Task:
     """A cell to measure, a cell whose reference gradient is to be computed, or the start of a descent to be computed."""
 
     cell: Cell
-    reference: bool = False
-    descent: bool = False
+    kind: Literal["", "reference", "descent"] = ""
 
     def __str__(self) -> str:
         shown = {**self.cell.parts, "integrator": None, "backend": self.backend}
-        parts = [part for axis, part in shown.items() if not (self.reference and axis == "estimator")]
-        what = "reference of" if self.reference else "descent of" if self.descent else ""
-        return " ".join([what, *(p.name for p in parts if p is not None)]).strip()
+        parts = [part for axis, part in shown.items() if not (self.kind == "reference" and axis == "estimator")]
+        return " ".join([*[f"{self.kind} of"] * bool(self.kind), *(p.name for p in parts if p is not None)])
 
     @property
     def backend(self) -> Backend:
         """The backend that runs the task."""
-        return self.cell.reference_backends[0] if self.reference else self.cell.backend
+        return self.cell.reference_backends[0] if self.kind == "reference" else self.cell.backend
 
     @cached_property
     def outside(self) -> frozenset[str]:
@@ -65,7 +63,9 @@ class Task:
     def outside_of_reference(self) -> frozenset[str]:
         """The part of :attr:`outside` that decides the reference gradient."""
         program = (self.cell.parts.get(axis) for axis in PROBLEM)
-        return self.outside if self.reference else outside_of([*program, *self.cell.reference_backends])
+        if self.kind == "reference":
+            return self.outside
+        return outside_of([*program, *self.cell.reference_backends])
 
 
 class TaskHandler:
@@ -73,7 +73,7 @@ class TaskHandler:
 
     def __init__(self, experiment: Experiment, single_thread: bool = False) -> None:
         self._session = RunSession(experiment)
-        self._study = study_of(experiment)
+        self._study = experiment.study
         self._state = isolation.ProcessState(single_thread)
         RAN.update(registry.IMPORTED)
         self.is_tainted = False
@@ -115,17 +115,17 @@ class TaskHandler:
             result["reads"] = reads.manifest()
         if others := RAN - item.outside:
             remark = f"this process has also run code of {printable(', '.join(sorted(others)))}"
-            result["reason"] = "; ".join(filter(None, (result.get("reason", ""), remark)))
+            result = with_remarks(result, remark)
         return result
 
     def _handle(self, item: Task) -> dict[str, Any]:
         # other code may have changed what computes it
         self._session.references.stores = item.outside_of_reference >= RAN
         with guard.protect_process():
-            if not (item.reference or item.descent):
+            if not item.kind:
                 return measure_cell(item.cell, self._session, self._study)
             try:
-                if item.descent:
+                if item.kind == "descent":
                     return {"status": "ok", "descent": asdict(descent.descend(self._session.problem(item.cell)))}
                 self._session.references.of(item.cell)
             except (StorageError, KeyboardInterrupt):
@@ -161,12 +161,17 @@ def measure_cell(cell: Cell, session: RunSession, study: Study) -> dict[str, Any
     if not cell.timing:
         blank = study.columns.blank()
         result |= {name: blank[name] for name in study.columns.measured}
-    result |= solver_columns(cell, session, result)
-    return result | {"reason": "; ".join(filter(None, (result.get("reason", ""), *cell.remarks)))}
+    result = solved(cell, session, result)
+    return with_remarks(result, *cell.remarks)
 
 
-def solver_columns(cell: Cell, session: RunSession, result: dict[str, Any]) -> dict[str, Any]:
-    """Return the residual of the backend's constraint solver, and its remarks in ``reason``, also where it has not converged.
+def with_remarks(result: dict[str, Any], *remarks: str) -> dict[str, Any]:
+    """Return a result with remarks at the end of its reason."""
+    return result | {"reason": "; ".join(filter(None, (result.get("reason", ""), *remarks)))}
+
+
+def solved(cell: Cell, session: RunSession, result: dict[str, Any]) -> dict[str, Any]:
+    """Return a result with the residual of the backend's constraint solver, and its remarks, also where it has not converged.
 
     A backend whose physics differ from those that its name stands for has a method ``remarks(program)``: a text for each.
     A backend whose steps solve for contact forces iteratively has a method ``solver_residual(problem, w)``: the largest
@@ -175,19 +180,19 @@ def solver_columns(cell: Cell, session: RunSession, result: dict[str, Any]) -> d
     backend: Any = cell.parts.get("backend")
     names = [name for name in ("remarks", "solver_residual") if hasattr(backend, name)]
     if not names or result["status"] != "ok":
-        return {}
-    columns: dict[str, Any] = {}
+        return result
     program = cell.program()
     remarks = [f"{PHYSICS}{text}" for text in backend.remarks(program)] if "remarks" in names else []
     if "solver_residual" in names:
         w = noise.shared(cell.seed, cell.scene.name, 1, cell.samples, program.n_noise)[0].T
-        columns["solver_residual"] = residual = float(backend.solver_residual(session.problem(cell), w))
+        residual = float(backend.solver_residual(session.problem(cell), w))
+        result |= {"solver_residual": residual}
         # largest relative residual of a constraint solver that has converged, by type of the simulation
         if residual > {"float64": 1e-8, "float32": 1e-4}[cell.backend.dtype]:
             remarks.append(
                 f"the constraint solver has not converged (relative residual {residual:.1e}): more iterations give another gradient"
             )
-    return columns | {"reason": "; ".join(filter(None, (result.get("reason", ""), *remarks)))}
+    return with_remarks(result, *remarks)
 
 
 def _fault_of(result: dict[str, Any], study: Study) -> str:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Backend, CallableProgram, Problem, Program, Unsupported, param
+from bench.model import Backend, CallableProgram, Problem, Program, Unsupported, central_differences, param
 
 
 @dataclass(frozen=True)
@@ -39,27 +39,18 @@ class CallableProblem(Problem):
         self._simulator, self._step = program.scene.simulator(), step
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return self._simulator.costs(*self._split(theta, w))
+        return self._costs(theta + self.sigma * w[: self.dim], w[self.dim :])
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        thetas, noise = self._split(theta, w)
-        gradients = (
-            self._simulator.gradients(thetas, noise)
-            if self._simulator.has_gradient
-            else self._differences(thetas, noise)
-        )
-        return np.where(np.isfinite(self._simulator.costs(thetas, noise)), gradients, np.nan)
+        simulator, thetas, noise = self._simulator, theta + self.sigma * w[: self.dim], w[self.dim :]
+        if simulator.has_gradient:
+            gradients = simulator.gradients(thetas, noise if len(noise) else None)
+        else:
+            self.usage.rollouts += 2 * self.dim * thetas.shape[1]
+            steps = self._step * simulator.layout.scales()
+            gradients = central_differences(self._costs, thetas, noise, steps, self.block)
+        return np.where(np.isfinite(self._costs(thetas, noise)), gradients, np.nan)
 
-    def _differences(self, thetas: np.ndarray, noise: np.ndarray | None) -> np.ndarray:
-        self.usage.rollouts += 2 * self.dim * thetas.shape[1]
-        rows = []
-        for i, scale in enumerate(self._simulator.layout.scales()):
-            step = np.zeros((self.dim, 1))
-            step[i] = self._step * scale
-            up, down = self._simulator.costs(thetas + step, noise), self._simulator.costs(thetas - step, noise)
-            rows.append((up - down) / (2 * step[i]))
-        return np.stack(rows)
-
-    def _split(self, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return theta plus its noise, ``(d, B)``, and the simulator's own noise ``(n, B)`` or None."""
-        return theta + self.sigma * w[: self.dim], w[self.dim :] if w.shape[0] > self.dim else None
+    def _costs(self, thetas: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return the costs at thetas ``(d, B)`` with the simulator's own noise ``(n, B)``, which may have no rows."""
+        return self._simulator.costs(thetas, noise if len(noise) else None)

@@ -12,9 +12,6 @@ from bench.model import Array, Ops
 
 from .jax import Jax, JaxOps, use_double_precision
 
-ROUNDING = 8.0
-"""Units in the last place of the unknown below which a residual counts as rounding error."""
-
 
 @dataclass(frozen=True)
 class Implicit(Jax):
@@ -122,7 +119,8 @@ def _newton() -> Any:
             return jnp.where(self._is_rounding(y, state), y + state.diff, y), aux, {}
 
         def _is_rounding(self, y: Any, state: Any) -> Any:
-            allowed = ROUNDING * jnp.finfo(y.dtype).eps * (1.0 + jnp.abs(y).max()) * state.diffsize_prev
+            # units in the last place of the unknown below which a residual counts as rounding error
+            allowed = 8.0 * jnp.finfo(y.dtype).eps * (1.0 + jnp.abs(y).max()) * state.diffsize_prev
             # iterations before a residual may count as rounding error. Newton's method needs fewer if it
             # converges
             return (state.step >= 8) & jnp.isfinite(state.f).all() & (jnp.abs(state.f).max() <= allowed)

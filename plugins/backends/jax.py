@@ -102,10 +102,6 @@ def loop(body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int, reco
     return jax.lax.scan(lambda state, x: (one(state, x), None), carry, xs, length)[0]
 
 
-LARGE = 1 << 14
-"""Length of theta from which a column is a block's worth of work: blocks then have few columns, and hardly any padding."""
-
-
 def _numbers(program: Program) -> int:
     """Return an estimate of the numbers stored per rollout gradient: carries, controls, gradients, theta and noise."""
     stored = 2 * program.dim + program.n_noise
@@ -136,9 +132,9 @@ class JaxProblem(Problem):
         self.device = str(jax.default_backend())
         if self.device == "cpu":
             self.fit_blocks(_numbers(program) * self._dtype.itemsize)
-            if program.dim >= LARGE:
-                # columns per block from that length on: theta, per column, and its derivative fit a core's
-                # cache
+            if program.dim >= 1 << 14:
+                # a column is a block's worth of work: theta, per column, and its derivative fit a core's cache, and
+                # few columns need hardly any padding
                 self.grain = self.block = self.least = 8
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:

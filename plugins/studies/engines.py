@@ -155,8 +155,7 @@ def _model_error(cell: Cell, session: Session, gradient: np.ndarray) -> dict[str
     if expected is None:
         if not cell.ranked_backends:
             return {"model": ""}
-        own = session.problems.of(cell.ranked_backends[0], cell)
-        expected = own.grad(own.program.theta0, np.zeros((own.program.n_noise, 1)))[:, 0]
+        expected = session.problems.of(cell.ranked_backends[0], cell).grad()
         model = "the scene's own program"
     error = relative_error(gradient, expected)
     return {"model": model, "model_gradient": expected.tolist(), "model_error_rel": error}

@@ -16,6 +16,7 @@ from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule, bo
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Table, Views
+from bench.measure.statistics import ends
 from bench.model import Rollout, columns, param
 
 from . import PARTS, StudyPackage, all_noise, finite_status, mean_interval, norm
@@ -134,9 +135,8 @@ class Growth(StudyPackage):
             terms = np.where(good, terms, math.nan).reshape(len(theta), cell.repeats, cell.samples)
             with np.errstate(over="ignore"):
                 totals = np.nansum(np.nanvar(terms, axis=2, ddof=1), axis=0)
-            found = (np.median(totals), *np.quantile(totals, [QUANTILES["low"], QUANTILES["high"]]), totals.mean())
-            ends = zip(("", "_low", "_high", "_mean"), map(float, found), strict=True)
-            result |= {f"{order}_variance{end}": value for end, value in ends}
+            found = np.median(totals), *np.quantile(totals, [QUANTILES["low"], QUANTILES["high"]])
+            result |= ends(f"{order}_variance", map(float, found)) | {f"{order}_variance_mean": float(totals.mean())}
         steps = problem.jacobians(theta, w[:, good][:, : self.rollouts]).a
         singular, spectral = products(steps)
         rates = {"stretch": rate(singular[:, 0], len(steps)), "spectral": rate(spectral, len(steps))}
@@ -257,8 +257,7 @@ def fit(horizons: np.ndarray, norms: np.ndarray, errors: np.ndarray, bounded: bo
         verdict = "vanishing"
     elif order[1] > 0 and (odds <= 1 / STRONG or (odds <= 1 and bounded)):
         verdict = "polynomial"
-    names = (f"{name}{end}" for name in ("order", "rate") for end in ("", "_low", "_high"))
-    return {"verdict": verdict, "odds": odds, **dict(zip(names, (*order, *rate), strict=True))}
+    return {"verdict": verdict, "odds": odds, **ends("order", order), **ends("rate", rate)}
 
 
 def _slope(places: np.ndarray, logarithms: np.ndarray, errors: np.ndarray) -> tuple[float, ...]:

@@ -118,7 +118,7 @@ class Stability(StudyPackage):
         program = rollout(cell.program())
         problem, scene = session.problem(cell), program.scene
         theta, still = program.theta0, np.zeros((problem.program.n_noise, 1))
-        gradient = problem.grad(theta, still)[:, 0]
+        gradient = problem.grad()
         trajectory = problem.trajectory(theta, still)
         states, largest = trajectory.states[:, :, 0], bounds(program, trajectory, self.diverged)
         growth = growth_factor(states) if isinstance(scene, Oscillator) else math.nan
@@ -278,7 +278,7 @@ def _gradient_at(cell: Cell, steps: int, span: float = 0.0) -> np.ndarray:
             costs = [[problem.value(theta + s * e, still)[0] for s in (1, -1)] for e in h * np.eye(len(theta))]
             _fine_gradients[key] = np.array([(after - before) / (2 * h) for after, before in costs])
         else:
-            _fine_gradients[key] = problem.grad(theta, still)[:, 0]
+            _fine_gradients[key] = problem.grad()
     return _fine_gradients[key]
 
 

@@ -134,7 +134,7 @@ def difference_check(problem: Problem) -> tuple[float, np.ndarray, np.ndarray, f
     Truncation errors and jumps dominate at large steps, rounding at small steps. All costs are one batch.
     """
     theta, n_noise = problem.program.theta0, problem.program.n_noise
-    gradient = problem.grad(theta, np.zeros((n_noise, 1)))[:, 0]
+    gradient = problem.grad()
     samples, *_ = sampled(
         lambda at: problem.value(at, np.zeros((n_noise, at.shape[1]))), theta, np.eye(theta.size), np.ones(theta.size),
         gradient, float(np.finfo(np.float64).eps), STEPS,

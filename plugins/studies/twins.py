@@ -84,8 +84,8 @@ class Twins(StudyPackage):
         twin, own = session.problem(cell), session.problems.of(other, cell)
         theta, still = twin.program.theta0, np.zeros((twin.program.n_noise, 1))
         path, own_path = (problem.trajectory(theta, still).states[:, :, 0] for problem in (twin, own))
-        gradient, own_gradient = (problem.grad(theta, still)[:, 0] for problem in (twin, own))
-        cost, own_cost = (float(problem.value(theta, still)[0]) for problem in (twin, own))
+        gradient, own_gradient = (problem.grad() for problem in (twin, own))
+        cost, own_cost = (float(problem.value()) for problem in (twin, own))
         differences, w = np.abs(path - own_path), first_batch(cell, len(still))
         relative = (differences / np.maximum(np.abs(own_path).max(axis=0), 1e-300)).max(axis=1)
         has_parted = not cell.ranked_backends and relative.max() > PARTED

@@ -17,8 +17,8 @@ from bench.experiment.axes import axes, with_axes
 from bench.experiment.parameters import number_problems, parsed
 from bench.measure import descent
 from bench.report.reproduce import commands
-from bench.run import descents
 from bench.run.execute import execute
+from bench.run.shared import Shared
 
 PUSHING = ("scenes=[pushing]", "scene.pushing.sigma=0.1", "backends=[numpy]", "estimators=[fobg]")
 SMALL = ("samples=8", "repeats=4", "reference.samples=256", "timing=false", "workers=0")
@@ -164,7 +164,7 @@ def test_all_cells_of_a_share_have_the_theta_of_one_stored_path(ran):
     assert list(rows["status"]) == ["ok"] * 6
     files = list((experiment.results_dir / "references").glob("descent_*.json"))
     assert len(files) == 1
-    found = descents.load(files[0].parent, files[0].stem.removeprefix("descent_"))
+    found = descent.DescentPath(**Shared(experiment).load(files[0].stem))
     for share, part in rows.groupby("descent"):
         expected = found.at(share).theta if share else tuple(problem().program.theta0)
         assert {tuple(point) for point in part["point"]} == {expected}

@@ -9,7 +9,7 @@ from bench.experiment.session import Problems
 from bench.measure.reference import Reference
 from bench.model import compose
 from bench.run import references
-from bench.run.references import SCALARS, References, load, save
+from bench.run.references import References
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def test_next_backend_computes_the_reference(made, monkeypatch):
     assert "after a failure of" in reference.note
     assert "TypeError" in reference.note
     # and what was stored is the same
-    assert load(found._path(cell)).note == reference.note
+    assert found._load(cell.reference_key).note == reference.note
 
 
 def test_first_error_is_raised_where_none_can(made, monkeypatch):
@@ -53,21 +53,30 @@ def test_first_error_is_raised_where_none_can(made, monkeypatch):
     assert not found.stored(cell)
 
 
-def test_stored_reference_is_the_same(tmp_path):
+def test_stored_reference_is_the_same(made):
+    found, _ = made
     batches = np.random.default_rng(0).standard_normal((64, 3))
     reference = Reference(batches, "sampling[n=64]", 0.1, np.ones(3), np.zeros(3), "a note", 0.04, 64)
-    save(reference, tmp_path / "r.parquet")
-    again = load(tmp_path / "r.parquet")
+    found._shared.save("r", vars(reference))
+    again = found._load("r")
     assert np.array_equal(again.batches, batches)
-    assert [getattr(again, name) for name in SCALARS] == ["sampling[n=64]", 0.1, "a note", 0.04, 64]
+    numbers = (again.method, again.error, again.note, again.spacing, again.samples)
+    assert numbers == ("sampling[n=64]", 0.1, "a note", 0.04, 64)
     assert again.known().standard_error == reference.known().standard_error > 0.1
     assert again.model_error == reference.model_error == pytest.approx(3**0.5)
 
 
-def test_a_reference_that_is_not_a_number_is_read_as_one(tmp_path):
-    """Parquet has null for it, and other workers and later runs read the file."""
-    save(Reference(np.full((1, 2), np.nan), "sampling[failed: costs]", np.nan), tmp_path / "r.parquet")
-    assert not load(tmp_path / "r.parquet").is_finite
+def test_a_reference_that_is_not_a_number_is_read_as_one(made):
+    """Other workers and later runs read the file."""
+    found, _ = made
+    found._shared.save("r", vars(Reference(np.full((1, 2), np.nan), "sampling[failed: costs]", np.nan)))
+    assert not found._load("r").is_finite
+
+
+def test_a_damaged_reference_is_computed_again(made):
+    found, _ = made
+    found._shared.save("r", {"batches": [["a"]]})
+    assert found._load("r") is None
 
 
 def test_scene_names_its_backends():

@@ -261,8 +261,6 @@ def test_terms_of_two_values_at_equal_distances_are_a_remark(share, least, most)
         (lambda: summarise(np.zeros((0, 3)), Truth.exact(np.zeros(3)), 1), r"given \(0, 3\)"),
         (lambda: summarise(np.zeros((4, 3)), Truth.exact(np.zeros(3)), 0), "given 0"),
         (lambda: Truth.exact(np.array([1.0, np.nan])), "not finite"),
-        (lambda: Truth.from_batches(np.zeros((1, 3))), "K > 1"),
-        (lambda: Truth.exact(np.zeros((2, 2))), "vector"),
     ],
 )
 def test_bad_input_is_refused_with_the_shapes(call, words):

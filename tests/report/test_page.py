@@ -32,7 +32,7 @@ def page(rows, study=None, **given):
     """The page of made-up rows, without drawings."""
     made = experiment(**given)
     if study is not None:
-        made = replace(made, study=study, columns=study.columns)
+        made = replace(made, study=study)
     return helpers.page(made, rows, replace(views_of(made, rows), charts=[]))
 
 

@@ -8,7 +8,8 @@ import pytest
 from trees import Tree, hearing_signals, processes_in, wait_for
 
 from bench.errors import UserError
-from bench.run.pool import Pool, ResourceLimits
+from bench.experiment.experiment import Execution
+from bench.run.pool import Pool
 
 FAULTS = '''
 """Estimators that misbehave."""
@@ -261,5 +262,5 @@ def nothing_starts(argument):
 
 @pytest.mark.slow
 def test_workers_that_cannot_start_end_the_run_at_once():
-    with Pool(2, nothing_starts, None, ResourceLimits()) as pool, pytest.raises(UserError, match="no handler today"):
+    with Pool(2, nothing_starts, None, Execution()) as pool, pytest.raises(UserError, match="no handler today"):
         list(pool.run([[1, 2], [3]]))

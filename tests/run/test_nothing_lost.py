@@ -16,9 +16,10 @@ from trees import bench, hearing_signals, processes_in, wait_for
 
 from bench.cli import main
 from bench.errors import UserError
+from bench.experiment.experiment import Execution
 from bench.host.guard import temporary_file
 from bench.run import files
-from bench.run.pool import Pool, ResourceLimits, _Worker
+from bench.run.pool import Pool, _Worker
 from bench.run.store import Store
 
 TINY = ["scenes=[heaviside]", "backends=[numpy]", "samples=8", "repeats=4", "timing=false", "workers=0", "--quiet"]
@@ -160,7 +161,7 @@ class Handler:
 
 
 def answers(items, limits=None, **more):
-    with Pool(1, Handler, None, limits or ResourceLimits(), folders=(), **more) as pool:
+    with Pool(1, Handler, None, limits or Execution(), folders=(), **more) as pool:
         found = [answer for some in pool.run([items]) for answer in some]
     return {str(answer.item[0]): answer.result for answer in found}, found
 
@@ -185,7 +186,7 @@ def test_large_items_behind_a_hanging_one_do_not_hold_up_the_clock():
     big = "x" * 600_000
     started = time.monotonic()
     results, found = answers(
-        [("sound", big), ("hangs", big), *((f"more{i}", big) for i in range(6))], ResourceLimits(1.0)
+        [("sound", big), ("hangs", big), *((f"more{i}", big) for i in range(6))], Execution(timeout=1.0)
     )
     assert time.monotonic() - started < 30
     assert results["hangs"]["status"] == "timeout"
@@ -222,7 +223,7 @@ def test_a_worker_that_ran_code_from_outside_gets_no_other_group():
     """Tens run the same code from outside, and 0 to 9 run none."""
     groups = [[(10,), (11,)], [(1,), (2,)], [(20,)], [(12,)], [(3,)]]
     with Pool(
-        1, Handler, None, ResourceLimits(), outside=lambda item: frozenset([item[0] // 10] if item[0] > 9 else [])
+        1, Handler, None, Execution(), outside=lambda item: frozenset([item[0] // 10] if item[0] > 9 else [])
     ) as pool:
         place = {answer.item[0]: answer.result["pid"] for some in pool.run(groups) for answer in some}
     assert sorted(place) == [1, 2, 3, 10, 11, 12, 20]
@@ -264,7 +265,8 @@ def test_an_open_connection_without_messages_is_not_a_fault():
 
 HELD = """
 import ctypes, os, subprocess, sys
-from bench.run.pool import _Worker, Pool, ResourceLimits
+from bench.experiment.experiment import Execution
+from bench.run.pool import _Worker, Pool
 
 class Holds:
     def __init__(self, argument):
@@ -279,7 +281,7 @@ class Holds:
 
 if __name__ == "__main__":
     import held
-    with Pool(1, held.Holds, None, ResourceLimits()) as pool:
+    with Pool(1, held.Holds, None, Execution()) as pool:
         list(pool.run([[sys.argv[1]]]))
 """
 
@@ -377,5 +379,5 @@ def test_a_backend_asked_for_references_moves_and_doubles_nothing(tmp_path, work
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("Written:") == 1
     assert (tmp_path / "here" / "out" / "custom" / "rows.parquet").exists()
-    assert list((tmp_path / "here" / "out" / "references").glob("*.parquet"))
+    assert list((tmp_path / "here" / "out" / "references").glob("*.json"))
     assert not list((tmp_path / "elsewhere").iterdir())

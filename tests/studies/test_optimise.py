@@ -14,7 +14,6 @@ from helpers import loaded
 import bench
 from bench.cli import main
 from bench.experiment import config
-from bench.experiment.study import study_of
 from bench.measure import performance
 from bench.run.session import RunSession
 
@@ -126,7 +125,7 @@ def test_paths_end_at_the_budget_and_near_the_optimum(finished):
 
 def measured(*words, folder):
     experiment, (cell,) = loaded(*BARE, *words, f"results_dir={folder}")
-    return study_of(experiment).measure(cell, RunSession(experiment))
+    return experiment.study.measure(cell, RunSession(experiment))
 
 
 def test_tables_charts_and_page(finished):

@@ -6,7 +6,6 @@ import pytest
 from helpers import loaded
 
 import bench.plugins  # noqa: F401
-from bench.experiment.study import study_of
 from bench.model import registry
 from bench.run.session import RunSession
 
@@ -32,7 +31,7 @@ def test_errors_are_those_against_the_closed_form(tmp_path, name, estimator):
     own = [f"estimators=[{estimator}]"] if "estimator" in study.axes else []
     words = ["name=one", f"study={name}", *SCENE, *own, f"samples={SAMPLES}", f"repeats={REPEATS}", "workers=0"]
     given, (cell,) = loaded(*words, f"results_dir={tmp_path}")
-    row = study_of(given).measure(cell, RunSession(given))
+    row = given.study.measure(cell, RunSession(given))
     exact = float(cell.scene.closed_form_gradient(None, None)[0])
     # a cost of -1 or 1 times a score of w / sigma, with grad J = sqrt(2 / pi) / sigma; a baseline of the others' mean costs
     noise = math.sqrt((math.pi / 2 - 1) / SAMPLES) * math.sqrt(SAMPLES / (SAMPLES - 1))

@@ -69,7 +69,7 @@ def ground_of(cell: Cell, problem: Problem, session: Session, settings: Any) -> 
     """Return the problem's optimum and common path, from a file beside the references or computed and stored."""
     optimizer, _ = search_parts(cell)
     key = hashed(cell.program_key, fingerprint(cell.study), fingerprint(optimizer), fingerprint(cell.backend))
-    found = stored_in(session, f"path_{key}.json", lambda: _compute(cell, problem, session, settings, optimizer))
+    found = stored_in(session, f"path_{key}", lambda: _compute(cell, problem, session, settings, optimizer))
     arrays = {name: np.array(found[name]) for name in ("thetas", "gradients", "variances")}
     return Ground(**found | arrays)
 

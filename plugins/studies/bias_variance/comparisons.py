@@ -14,11 +14,11 @@ import pandas as pd
 from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, interval, text
 from bench.measure import statistics
-from bench.model import SampleMean, registry
+from bench.model import registry
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.views import CATEGORIES, Arranged, attempted, estimator_curves, shown_rmse
 
-from .time_to_accuracy import ROLLOUTS, couples_samples
+from .time_to_accuracy import ROLLOUTS
 
 WORKS, FAILS, OPEN, NO_RESULT = "works", "fails", "open", "no result"
 """Verdicts of a method at a setting: its interval is below 1; above 1, or every estimate is 0; contains 1 or is not known; it
@@ -105,16 +105,10 @@ def has_law(rows: pd.DataFrame) -> pd.Series:
 
     A bias is constant where an estimate is a mean of terms. Weights that depend on all samples change it with their number.
     """
-    plugins = {name: entry.plugin for name, entry in registry.entries()["estimators"].items()}
-    known = {name: plugins.get(name) for name in rows["estimator"].unique()}
-    constant = {
-        name: plugin is not None
-        and not getattr(plugin, "fixed_work", False)
-        and (issubclass(plugin, SampleMean) or getattr(plugin, "unbiased", False) is True)
-        for name, plugin in known.items()
-    }
-    is_coupled = [couples_samples(row) for row in rows[["estimator", "draws"]].to_dict("records")]
-    return ~np.array(is_coupled, dtype=bool) & rows["estimator"].map(constant).astype(bool)
+    is_coupled = (rows["draws"] != "iid") | declares(rows, "couples_samples")
+    # ``separable`` is of sample means
+    is_constant = declares(rows, "separable") | declares(rows, "unbiased")
+    return ~is_coupled & is_constant & ~declares(rows, "fixed_work")
 
 
 def declares(rows: pd.DataFrame, fact: str) -> pd.Series:

@@ -18,6 +18,7 @@ import numpy as np
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import noise, timing
+from bench.measure.statistics import ends
 from bench.measure.timing import Pause
 from bench.model import IID, Auxiliaries, Problem, SampleMean, columns, per_repeat
 from bench.model.estimator import require_shape
@@ -70,12 +71,10 @@ class CellEstimates:
     @property
     def sums(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Per repeat, the sum of (term - common centre) and the sum of its squared norms; None without independent terms."""
-        if self.design != IID:
+        if self.design != IID or not self._terms:
             return None
-        ordered = [self._terms[repeat] for repeat in sorted(self._terms)]
-        return (
-            (np.array([rest for rest, _ in ordered]), np.array([square for _, square in ordered])) if ordered else None
-        )
+        rests, squares = zip(*(self._terms[repeat] for repeat in sorted(self._terms)), strict=True)
+        return np.array(rests), np.array(squares)
 
     def parts(self, repeat: int) -> Iterator[np.ndarray]:
         """Return an iterator over the noise of one repeat, in parts ``(n_w, b)``."""
@@ -154,28 +153,26 @@ def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]
     problem.reset_usage()
     started, compiled_s = time.perf_counter(), session.compilations.seconds
     parts: list[np.ndarray] = []
-    clock: timing.Timing | None = None
+    clock, usage, n_counted = timing.Timing(math.nan, math.nan), problem.usage, cell.repeats
     if calls:
         parts, clock = timing.timed(
             lambda r: estimates.of(r, r + 1), calls, settle_s=study.settle_s, pause=estimates.pause
         )
-    # copied here, because the estimates below, which are not timed, raise the counts further
-    usage, n_counted = replace(problem.usage), clock.calls if clock else cell.repeats
+        # a copy, because the estimates below, which are not timed, raise the counts further
+        usage, n_counted = replace(usage), clock.calls
     if calls < cell.repeats:
         parts.append(estimates.of(calls, cell.repeats))
-    if clock is None:
-        usage = replace(problem.usage)
     elapsed = time.perf_counter() - started
     values = np.concatenate(parts)
 
     auxiliaries = summarise_diagnostics([estimates.diagnostics[start] for start in sorted(estimates.diagnostics)])
     result: dict[str, Any] = {
         "model_error": truth.model_error,
-        "time_s": clock.median_s if clock else math.nan,
-        "time_iqr_s": clock.iqr_s if clock else math.nan,
-        "time_samples": list(clock.samples_s) if clock else [],
+        "time_s": clock.median_s,
+        "time_iqr_s": clock.iqr_s,
+        "time_samples": list(clock.samples_s),
         "noise_s": noise.seconds(cell.seed, cell.scene.name, cell.samples, program.n_noise, estimates.design)
-        if clock
+        if calls
         else math.nan,
         "estimates_s": elapsed,
         "compile_s": session.compilations.seconds - compiled_s or math.nan,
@@ -204,8 +201,7 @@ def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]
 def costs_of(problem: Problem, w: np.ndarray) -> dict[str, float]:
     """Return the columns of the costs at theta with noise ``w (n_w, b)``: mean, and the range of 95% of them."""
     costs = problem.value(problem.program.theta0, w)
-    low, high = np.quantile(costs, (0.025, 0.975))
-    return {"cost": float(costs.mean()), "cost_low": float(low), "cost_high": float(high)}
+    return ends("cost", map(float, (costs.mean(), *np.quantile(costs, (0.025, 0.975)))))
 
 
 def summarise_diagnostics(diagnostics: list[Auxiliaries]) -> str:

@@ -13,7 +13,7 @@ import pandas as pd
 from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, interval, text
 from bench.experiment.views import Table
-from bench.measure.statistics import is_unexplained
+from bench.measure.statistics import ends, is_unexplained
 from bench.model import registry
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.text import axis_value, number, short_duration
@@ -241,8 +241,8 @@ def _following(first: str, reached: dict[str, RequiredCost]) -> dict[str, Any]:
     }  # fmt: skip
     least = {name: low if math.isnan(factor) else factor for name, (factor, low, _) in leads.items()}
     following = min(leads, key=least.__getitem__, default="-")
-    numbers = zip(("factor", "factor_low", "factor_high"), leads.get(following, (math.nan,) * 3), strict=True)
-    return {"next": following, **dict(numbers), "tied": tuple(n for n, (_, low, _) in leads.items() if not low > 1.0)}
+    factor = ends("factor", leads.get(following, (math.nan,) * 3))
+    return {"next": following, **factor, "tied": tuple(n for n, (_, low, _) in leads.items() if not low > 1.0)}
 
 
 def accuracy_table(best: pd.DataFrame) -> Table:

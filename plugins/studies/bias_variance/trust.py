@@ -1,9 +1,8 @@
 """When may a first-order gradient be trusted? ``python -m bench.plugins.studies.bias_variance.trust results/standard`` counts.
 
-The rules use the mean of the estimates, their spread between repeats and the remark on the row, but not the reference.
-Each rule is scored on all stored cells of ``fobg`` (or of the estimators named after the folder): how many cells it
-trusts, how many trusted cells are wrong (relative RMSE of :data:`WRONG` or more), and how many accurate cells it does
-not trust.
+The rule uses the mean of the estimates and their spread between repeats, but not the reference. It is counted on all stored
+cells of ``fobg``, or of the estimators named after the folder: how many cells it trusts, how many of them are wrong (relative
+RMSE of :data:`WRONG` or more), and how many of the others are right.
 """
 
 from __future__ import annotations
@@ -11,17 +10,14 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from bench.experiment.parameters import parsed
-from bench.report.tables import plain_markdown
-from bench.report.text import number
 from bench.run.rows import read_parquet
 
 from .. import PARTS, SPREAD
@@ -43,11 +39,6 @@ def spread(rows: pd.DataFrame) -> pd.Series:
     """Return the standard deviation of one estimate over the norm of the mean estimate; infinite where the norm is 0."""
     ratio = np.sqrt(rows["variance"]) / rows["grad_norm"].where(rows["grad_norm"] > 0)
     return ratio.fillna(np.inf)
-
-
-def stable(rows: pd.DataFrame) -> pd.Series:
-    """Return whether each row has no remark. A remark on heavy tails points to an unstable step."""
-    return rows["reason"] == ""
 
 
 def trusted(folder: Path, rows: pd.DataFrame) -> pd.Series:
@@ -80,35 +71,20 @@ def headline(answers: pd.Series) -> str:
     return f"trusted: fobg {listed}{how}" if listed else ""
 
 
-RULES: Mapping[str, Callable[[pd.DataFrame], Any]] = {
-    "always": lambda rows: np.ones(len(rows), dtype=bool),
-    "no remark on its interval": stable,
-    f"spread of one estimate below {SPREAD:g} of its mean": lambda rows: spread(rows) < SPREAD,
-    "both": lambda rows: stable(rows) & (spread(rows) < SPREAD),
-}
-
-
-def score_rules(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return a line per rule: cells trusted, wrong cells trusted, worst trusted error, and right cells not trusted."""
-    wrong = rows["rmse_rel"] >= WRONG
-    lines = []
-    for name, rule in RULES.items():
-        trusted = np.asarray(rule(rows), dtype=bool)
-        worst = rows.loc[trusted, "rmse_rel"].max()
-        lines.append((name, trusted.sum(), (trusted & wrong).sum(), number(float(worst)), (~trusted & ~wrong).sum()))
-    return pd.DataFrame(
-        lines, columns=["rule", "trusted", "of those wrong", "worst relative RMSE", "right ones not trusted"]
-    )
+def counts(rows: pd.DataFrame) -> dict[str, int]:
+    """Return the numbers of cells, of trusted ones and the wrong ones among them, of others and the right ones among them."""
+    keep, wrong = spread(rows) < SPREAD, rows["rmse_rel"] >= WRONG
+    kinds = dict(cells=keep | ~keep, trusted=keep, wrong=keep & wrong, others=~keep, missed=~keep & ~wrong)
+    return {name: int(kind.sum()) for name, kind in kinds.items()}
 
 
 def main(words: Sequence[str]) -> None:
-    """Print each rule's score; ``words`` are a results folder (default ``results/standard``) and estimators (``fobg``)."""
+    """Print the counts; ``words`` are a results folder (default ``results/standard``) and estimators (``fobg``)."""
     folder, estimators = Path(words[0] if words else "results/standard"), words[1:] or ["fobg"]
-    rows = cells(folder, estimators)
-    print(
-        f"{', '.join(estimators)}: {len(rows)} cells, {(rows['rmse_rel'] >= WRONG).sum()} wrong by {WRONG:g} of the gradient or more\n"
+    text = (
+        "the spread trusts {trusted} of {cells} cells, {wrong} of them wrong; of the {others} others {missed} are right"
     )
-    print(plain_markdown(score_rules(rows).astype(str)))
+    print(f"{', '.join(estimators)}: {text.format(**counts(cells(folder, estimators)))}")
 
 
 if __name__ == "__main__":

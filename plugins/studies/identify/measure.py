@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,8 +16,10 @@ from scipy.special import chdtri
 from bench.errors import Unsupported
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
-from bench.host.parameters import named
+from bench.host.parameters import parameters
 from bench.measure import noise, performance
+from bench.measure.statistics import ends
+from bench.model import Program
 
 from .. import norm
 from . import Identify, adequacy
@@ -132,10 +135,10 @@ def _intervals(fit: Fit, known: Information, theta: np.ndarray) -> _Intervals:
     return _Intervals(estimate, size, half, low, high, kind)
 
 
-def _units(model: Model, names: tuple[str, ...]) -> dict[str, str]:
-    """Return the units of unknowns; empty for entries of the initial state."""
-    parts = [*map(type, model.program.parts.values())]
-    return {name: (part.unit or "1") if (part := named(parts, name)) else "" for name in names}
+def _units(program: Program, names: tuple[str, ...]) -> dict[str, str]:
+    """Return the units of unknowns; empty for entries of the initial state, which follow the parameters."""
+    units = [parameters(type(program.parts[axis]))[name].unit or "1" for axis, name in program.named]
+    return dict(itertools.zip_longest(names, units, fillvalue=""))
 
 
 def _estimates(fit: Fit, known: Information, start: np.ndarray, own: Mapping[str, str]) -> dict[str, Any]:
@@ -143,56 +146,61 @@ def _estimates(fit: Fit, known: Information, start: np.ndarray, own: Mapping[str
 
     ``explained`` is the share of records that no test contradicts. The other columns belong to the first record.
     """
-    model, invariants, p, rank = fit.fitting.model, known.invariants, len(known.names), known.rank
+    model, p = fit.fitting.model, len(known.names)
     theta = model.theta(fit.solution[:p, :1])[:, 0]
-    # the invariants, then the parameters that are none
-    names = list(dict.fromkeys([*known.labels, *known.names]))
-    exponents = np.concatenate([invariants, np.eye(p)[[known.names.index(name) for name in names[rank:]]]])
-    is_seen = (np.abs(exponents @ invariants.T) > SHARE).any(axis=1)
-    units = _units(model, known.names)
-    factors = tuple(f"({unit})" if {*unit} & {*" /"} else unit or "1" for unit in units.values())
-    intervals, nothing = _intervals(fit, known, theta), [math.nan] * (len(names) - rank)
-    result = {
-        "parameter": names,
-        "estimate": [*intervals.estimate, *nothing],
-        "estimate_low": [*intervals.low, *nothing],
-        "estimate_high": [*intervals.high, *nothing],
-        "unit": [units.get(name, product(factors, row)) for name, row in zip(names, exponents, strict=True)],
-        "start": _products(start, exponents).tolist(),
-        "interval_noise": intervals.noise,
-        "identifiable": ["yes" if k < rank else "product" if seen else "no" for k, seen in enumerate(is_seen)],
-        "bias": [math.nan] * len(names),
-        "biased": [],
-        "term": [],
-        "unnoticed": [],
-        "errors": [],
-    }
+    intervals = _intervals(fit, known, theta)
+    result = _parameters(model, known, intervals, start)
     # most records whose residuals are tested
     finite = np.flatnonzero(fit.is_finite)[:64].tolist()
     if not finite or finite[0]:
         return result
     # the effects of missing terms at one fit serve all records, which have the same truth
     terms = missing_terms(model, theta, fit.fitting.noise, own)
+    channels = len(model.measured)
     verdicts = [
-        adequacy.judge(
-            fit.residual[:, i], known.along(fit.slopes(i)), len(model.measured), terms, i, fit.is_noise_known
-        )
+        adequacy.judge(fit.residual[:, i], known.along(fit.slopes(i)), channels, terms, i, fit.is_noise_known)
         for i in finite
     ]
     first = verdicts[0]
     result |= {
         "explained": float(np.mean([one.is_explained for one in verdicts])) + 0.0 * first.probability,  # nan: untested
         "contradictions": ", ".join(f"{name} ({value:.2g})" for name, value in first.contradictions.items()),
-        "noise_size": fit.fitting.noise * norm(fit.residual[:, 0]) / math.sqrt(max(len(fit.residual) - rank, 1)),
+        "noise_size": fit.fitting.noise * norm(fit.residual[:, 0]) / math.sqrt(max(len(fit.residual) - known.rank, 1)),
     }
-    if not first.reach:
-        return result
-    biases = _hidden_biases(fit, known, np.array([terms[name] for name in first.reach]), [*first.reach.values()])
+    return result | _unnoticed(fit, known, intervals, terms, first.reach) if first.reach else result
+
+
+def _parameters(model: Model, known: Information, intervals: _Intervals, start: np.ndarray) -> dict[str, Any]:
+    """Return the columns of the invariants, then of the parameters that are none, without biases."""
+    names = list(dict.fromkeys([*known.labels, *known.names]))
+    others = np.eye(len(known.names))[[known.names.index(name) for name in names[known.rank :]]]
+    exponents = np.concatenate([known.invariants, others])
+    is_seen = (np.abs(exponents @ known.invariants.T) > SHARE).any(axis=1)
+    units, nothing = _units(model.program, known.names), [math.nan] * len(others)
+    factors = tuple(f"({unit})" if {*unit} & {*" /"} else unit or "1" for unit in units.values())
+    return {
+        "parameter": names,
+        **ends("estimate", ([*part, *nothing] for part in (intervals.estimate, intervals.low, intervals.high))),
+        "unit": [units.get(name, product(factors, row)) for name, row in zip(names, exponents, strict=True)],
+        "start": _products(start, exponents).tolist(),
+        "interval_noise": intervals.noise,
+        "identifiable": ["yes" if k < known.rank else "product" if seen else "no" for k, seen in enumerate(is_seen)],
+        "bias": [math.nan] * len(names),
+        **{name: [] for name in ("biased", "term", "unnoticed", "errors")},
+    }
+
+
+def _unnoticed(
+    fit: Fit, known: Information, intervals: _Intervals, terms: Mapping[str, np.ndarray], reach: Mapping[str, float]
+) -> dict[str, Any]:
+    """Return the columns of the biases by terms of a size, in ``reach``, that tests just miss."""
+    biases = _hidden_biases(fit, known, np.array([terms[name] for name in reach]), [*reach.values()])
     unnoticed = biases * intervals.size[:, None]
-    return result | {
+    nothing = [math.nan] * (len({*known.labels, *known.names}) - known.rank)
+    return {
         "bias": [*unnoticed.max(axis=1, initial=0.0), *nothing],
-        "biased": np.repeat(known.labels, len(first.reach)).tolist(),
-        "term": [*first.reach] * rank,
+        "biased": np.repeat(known.labels, len(reach)).tolist(),
+        "term": [*reach] * known.rank,
         "unnoticed": unnoticed.ravel().tolist(),
         "errors": (biases * performance.Z / intervals.half[:, None]).ravel().tolist(),
     }
@@ -245,15 +253,13 @@ def _fit_statistics(fit: Fit, known: Information, is_own: bool) -> dict[str, Any
         coverage = float(is_covered.mean())
         # the sample size of this interval is the number of records: invariants of one record are dependent
         interval = performance.wilson(round(coverage * n_converged), n_converged)
-    names = [f"{name}_{end}" for name in ("converged", "coverage") for end in ("low", "high")]
     return {
         "shooting": shooting,
         "optimum": float(fit.has_converged.mean()),
-        "converged": n_converged / n_fits,
+        **ends("converged", (n_converged / n_fits, *performance.wilson(n_converged, n_fits))),
         "error": float(np.sqrt(np.mean(np.square(errors)))) if errors.size else math.nan,
-        "coverage": coverage,
+        **ends("coverage", (coverage, *interval)),
         "hidden": hidden,
-        **dict(zip(names, (*performance.wilson(n_converged, n_fits), *interval), strict=True)),
     }
 
 

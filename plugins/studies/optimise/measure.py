@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 import timeit
@@ -16,7 +15,7 @@ from bench.experiment.session import Session
 from bench.measure import noise
 from bench.model import IID, Answer, Design, Estimator, KnownOptimum, Optimizer, Problem, Rollout, zeroth_order
 from bench.model.program import OWN
-from bench.run.files import make_directory, write_whole
+from bench.run.shared import Shared
 
 from .. import against_reference, ratio
 from . import Optimise, search_parts
@@ -158,7 +157,7 @@ def known_optimum(cell: Cell, problem: Problem, session: Session) -> tuple[float
     # largest dimension of theta for which Newton's method computes the optimum
     if problem.dim > 1000 or not problem.program.continuous or "grad" not in cell.backend.provides:
         return np.nan, "unknown"
-    found = stored_in(session, f"optimum_{cell.program_key}.json", lambda: _newton(problem))
+    found = stored_in(session, f"optimum_{cell.program_key}", lambda: _newton(problem))
     return found["cost"], found["how"]
 
 
@@ -173,15 +172,13 @@ def _newton(problem: Problem) -> dict[str, Any]:
 
 
 def stored_in(session: Session, name: str, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """Return the content of a JSON file beside the references, which is computed and written if it cannot be read."""
-    path = session.experiment.results_dir / "references" / name
-    try:
-        content: dict[str, Any] = json.loads(path.read_text())
-    except (OSError, ValueError):
-        content = compute()
-        make_directory(path.parent)
-        write_whole(path, json.dumps(content).encode())
-    return content
+    """Return a result that cells share, computed and stored at first use, see :class:`bench.run.shared.Shared`."""
+    shared = Shared(session.experiment)
+    found = shared.load(name)
+    if found is None:
+        found = compute()
+        shared.save(name, found)
+    return found
 
 
 def scene_class(cell: Cell, problem: Problem) -> str:

@@ -17,7 +17,7 @@ from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import noise
 from bench.measure.performance import Z
-from bench.measure.statistics import Sampling, bias_interval
+from bench.measure.statistics import Sampling, bias_interval, ends
 from bench.model import Trainer
 from bench.model.trainer import LOGGED
 from bench.training.environment import Environment
@@ -81,9 +81,7 @@ def measure(cell: Cell, session: Session, settings: Train) -> dict[str, Any]:
         "status": "ok" if bad is None else "nonfinite",
         "reason": "" if bad is None else f"{bad[1]} is not finite at update {bad[0]}",
         "first_return": table[0, 3],
-        "final_return": final[0],
-        "final_return_low": final[1],
-        "final_return_high": final[2],
+        **ends("final_return", final[:3]),
         "final_median": final[3],
         "updates": int(table[-1, 0]),
         "steps": int(table[-1, 1]),
@@ -171,8 +169,7 @@ def _windows(training: Training, state: Any, batches: int) -> dict[str, Any]:
         if np.isfinite(window).all() and np.isfinite(whole).all() and scale > 0:
             difference = window - whole
             bias = bias_interval(difference.mean(axis=0), Sampling.of(difference))
-            names = ("window_bias", "window_bias_low", "window_bias_high")
-            result |= {name: value / scale for name, value in zip(names, bias, strict=True)}
+            result |= ends("window_bias", (value / scale for value in bias))
     return result
 
 
