@@ -180,7 +180,6 @@ class Planted:
 @pytest.mark.parametrize(
     ("change", "reason", "at"),
     [
-        (lambda by, all: -by, "-1 times", "free_joint qpos"),
         (lambda by, all: 0.0 * by, "0", "free_joint qpos"),
         (lambda by, all: all["qvel"], "the numbers of qvel", "weld qpos"),
         (lambda by, all: by[[3, 4, 5, 0, 1, 2]], "in the order [3, 4, 5, 0, 1, 2]", "elliptic_slide qpos"),
