@@ -238,24 +238,23 @@ def _function_name(function: Any) -> str:
 class _Examination:
     def __init__(self, simulator: Simulator, setup: Setup) -> None:
         self.simulator, self.setup, self.clock = simulator, setup, simulator.clock
-        self.left_out: list[str] = []
         self.explained = diagnosis.Explanation()
         self.means: Mean | None = None
         self._near: list[LineScan] | None = None
         """Lines at theta that do not depend on sigma."""
         self.stages = GradientStages(simulator, setup.scale, setup.seed, bool(setup.levels))
+        self.left_out = self.stages.left_out
 
     def run(self, named: Mapping[str, Any], refined: Any) -> Report:
         """Run the checks that the budget allows, the decisive ones first, and return the report."""
         simulator, clock, stages, setup, explained = self.simulator, self.clock, self.stages, self.setup, self.explained
         stages.run(self._compare_early)
-        self.left_out += stages.left_out
         checked = stages.check
         is_wrong = checked.cause in SUSPICIOUS
         has_gradient = stages.gradient is not None
         self._find_smooth_parts(checked)
         if refined is not None and has_gradient and (is_wrong or explained.smooth_parts):
-            self._compare_refined(refined, checked, is_wrong)
+            self._compare_refined(refined)
         if setup.horizons:
             self._explain("growth", "horizons", diagnosis.errors_by_horizon, setup.horizons)
         if is_wrong and has_gradient:
@@ -267,6 +266,7 @@ class _Examination:
             explained.is_adaptive = self._compare_along_lines(checked, 0.9)
         lines = self._scan_lines(checked) if can_go_on else []
         smoothed = self._measure_noise(checked, lines) if can_go_on else []
+        stages.repeat_failures()
         return Report(
             **named,
             layout=simulator.layout,
@@ -335,13 +335,11 @@ class _Examination:
         if found is not None:
             setattr(self.explained, name, found)
 
-    def _compare_refined(self, refined: Any, checked: Check, is_wrong: bool) -> None:
+    def _compare_refined(self, refined: Any) -> None:
         """Compare gradient and cost with a refined cost, whose program is compiled once."""
         other = self._attempt("the refined cost", lambda: self.simulator.variant(refined))
-        if other is not None and is_wrong:
-            self._explain("gaps", "the refined cost", diagnosis.refined_gaps, other)
-        if other is not None and self.explained.smooth_parts:
-            self._explain("refined", "the refined cost", diagnosis.refined_slopes, other, diagnosis.doubtful(checked))
+        if other is not None:
+            self._explain("refined", "the refined cost", diagnosis.refined_slopes, other)
 
     # ------------------------------------------------------------------------------------------------ lines
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.errors import needing_sweeps
-from bench.examine.diagnosis import LOOSE, Explanation, grows, may_be_adaptive
+from bench.examine.diagnosis import LOOSE, Explanation, doubtful, grows, may_be_adaptive
 from bench.examine.hints import Hint, hint_of
 from bench.examine.lines import ALIKE, LineScan
 from bench.examine.means import OF_A_DRAW, Mean
@@ -19,7 +19,7 @@ from bench.examine.smoothing import TARGET_ERROR, Method, Smoothed
 from bench.examine.stages import Repeats, recaused
 from bench.examine.subspace import MOST
 from bench.gradient import FAULTS, TRUSTED, Check, Part, Sample, rules
-from bench.gradient.direction import CHANCE, resolution
+from bench.gradient.direction import CHANCE, MIN_STEPS, resolution
 from bench.gradient.roughness import FINE
 from bench.gradient.rules import EXCUSABLE, RULES, STATUS, SUSPICIOUS, UNEQUAL
 from bench.gradient.smooth_part import LIMIT
@@ -263,6 +263,15 @@ class Findings:
             for one in samples
         )
 
+    @cached_property
+    def _refined(self) -> dict[int | None, float]:
+        """The refined cost's derivatives by the components whose own differences show little."""
+        if self.explained.refined is None:
+            return {}
+        names = [part.component for part in self.check.components]
+        known = dict(zip(names, self.explained.refined[0, 2].tolist(), strict=True))
+        return {part.component: known[part.component] / part.sample.scale for part in doubtful(self.check)}
+
     def _of_smooth_part(self, part: Part) -> Part:
         """Return a part of a rough cost with the verdict that wide steps, or a refined cost, give.
 
@@ -271,7 +280,7 @@ class Findings:
         explained, is_open = self.explained, part.verdict in (*UNEQUAL, "unsettled")
         if part.component is None:
             return replace(part, verdict="smooth_part") if is_open or part.verdict in rules.BROKEN else part
-        wide, refined = explained.smooth_parts.get(part.component), explained.refined.get(part.component)
+        wide, refined = explained.smooth_parts.get(part.component), self._refined.get(part.component)
         if wide is None and refined is None:
             return part
         slope, error = (part.difference, math.inf) if wide is None else (wide.slope, wide.error)
@@ -407,10 +416,11 @@ class Findings:
         is_of_a_draw = self.is_random and failed in OF_A_DRAW and not self._is_of_draws
         is_suspicious = failed in SUSPICIOUS
         yield self._cause_of_mean, is_of_a_draw, self.mean_text
-        yield "staircase", is_suspicious and (self._is_residue or self.has_steps), numbers
+        yield "staircase", is_suspicious and (self._is_on_tread or self.has_steps), numbers
         yield "rough", failed == "unsettled" and self._is_rough, ""
         yield "adaptive", failed == "unsettled" and bool(explained.smooth_parts), numbers
-        is_gap = failed in EXCUSABLE and not explained.refined and self.is_discretisation_gap
+        is_decided = bool(explained.smooth_parts) and explained.refined is not None
+        is_gap = failed in EXCUSABLE and not is_decided and self.is_discretisation_gap
         loop = f", {explained.steps} has another length at other thetas" * bool(explained.steps)
         yield "adaptive", is_gap, f"{numbers}{loop}"
         is_grown = grows(explained.growth, self._tolerance_of_horizons)
@@ -418,7 +428,7 @@ class Findings:
         is_falling = self.hint is not None and self.hint.cause == "continuous_adjoint"
         yield "continuous_adjoint", is_falling and is_suspicious, numbers
         # so small an error that adaptive steps may explain it, and the budget ended before that was known
-        is_open = explained.is_adaptive is None and not explained.gaps and may_be_adaptive(self.check)
+        is_open = explained.is_adaptive is None and explained.refined is None and may_be_adaptive(self.check)
         yield "undecided", is_open and is_suspicious, f"{numbers}: adaptive steps may explain it"
         yield "unresolved", is_suspicious and self._is_slight, numbers
         yield failed, True, numbers
@@ -560,12 +570,14 @@ class Findings:
         return "".join(f"its mean is off by {span(*one.bias_percent)}%, at sigma {one.sigma:g}" for one in known[:1])
 
     @property
-    def _is_residue(self) -> bool:
-        """Whether the gradient is a residue beside the jumps of a cost that is constant around theta."""
-        wrong = [part for part in self.check.parts if part.verdict in SUSPICIOUS]
+    def _is_on_tread(self) -> bool:
+        """Whether the cost is constant at the smallest steps beside jumps: wider steps meet them, or the gradient is a residue."""
+        parts = self.check.components or self.check.parts
+        wrong = [part for part in parts if part.verdict in (*SUSPICIOUS, "unsettled")]
         height = max((jump.size for line in self.lines for jump in line.jumps), default=0.0)
-        return bool(wrong) and all(
-            not part.sample.differences.any() and abs(part.program) * part.sample.scale <= RESIDUE * height
+        return bool(height and wrong) and all(
+            not part.sample.differences[-MIN_STEPS:].any()
+            and (part.sample.differences.any() or abs(part.program) * part.sample.scale <= RESIDUE * height)
             for part in wrong
         )
 
@@ -589,13 +601,12 @@ class Findings:
         Either the gradient agrees with a refined cost where the cost's own differences do not, at every theta compared. Or
         the steps depend on theta, and the error is of the size of the jumps that this makes, or of a refined cost's gap.
         """
-        explained = self.explained
-        if not explained.gaps:
-            return bool(explained.steps and explained.is_adaptive)
-        if all(gap.gradient <= AGREES * gap.own for gap in explained.gaps):
-            return True
-        gradient, own, _ = np.linalg.norm(explained.gaps, axis=0)
-        return bool(explained.steps) and bool(gradient <= AS_FAR * own)
+        refined, is_varied = self.explained.refined, bool(self.explained.steps)
+        if refined is None:
+            return is_varied and bool(self.explained.is_adaptive)
+        gradient, own = np.linalg.norm(refined[:, :2] - refined[:, 2:], axis=2).T
+        is_far = np.linalg.norm(gradient) > AS_FAR * np.linalg.norm(own)
+        return bool((gradient <= AGREES * own).all() or (is_varied and not is_far))
 
     @property
     def derivative(self) -> str:

@@ -178,21 +178,15 @@ class GradientStages:
             self._start()
         if self.left_out:
             return
-        with self.clock.stage("calls that raised an exception, once more", self.left_out):
-            self._repeat_failures()
-            if self.is_failed:
-                return
+        self.repeat_failures()
+        if not self.is_failed:
             self._run_stages(explain)
-            self._repeat_failures()
 
-    def _repeat_failures(self) -> None:
+    def repeat_failures(self) -> None:
         """Repeat calls that raised an exception, which may do so at random."""
-        if self.is_failed:
-            again = self.gradient_at(self.theta)
-            self.repeats.is_failing |= bool(np.isfinite(again).all())
-        for at, *w in list(self.simulator.failed):
-            again = self.simulator.costs(at, *w)
-            self.repeats.is_failing |= bool(np.isfinite(again).any())
+        with self.clock.stage("calls that raised an exception, once more", self.left_out):
+            for call, *parts in list(self.simulator.failed):
+                self.repeats.is_failing |= bool(np.isfinite(call(*parts)).any())
 
     def _run_stages(self, explain: Callable[[Check], None]) -> None:
         space = choose(self.layout, self.scale, self.gradient, self.seed)

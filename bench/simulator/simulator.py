@@ -71,8 +71,8 @@ class Simulator:
         """Notes for the user on how the cost is called."""
         self.raised: dict[str, int] = {}
         """Number of failed calls of the cost, after the first call, by exception."""
-        self.failed: deque[tuple[np.ndarray, ...]] = deque(maxlen=KEPT)
-        """The thetas of the last of these calls, and the noise w where there is some."""
+        self.failed: deque[tuple[Any, ...]] = deque(maxlen=KEPT)
+        """The last failed calls: :meth:`costs` or :meth:`gradients`, their thetas, and the noise w where there is some."""
         self.gradient_error = ""
         """The first exception of the gradient, or an empty string."""
         self.n_failed_gradients = 0
@@ -224,10 +224,13 @@ class Simulator:
         except Exception as error:
             if self.clock.is_interrupted:
                 raise OutOfTime from None
-            self.failed.append(tuple(part.copy() for part in parts))  # whose memory is used again
+            self._keep_failed(self.costs, parts)
             text = f"{type(error).__name__}: {error}"
             self.raised[text] = self.raised.get(text, 0) + 1
             return np.full(parts[0].shape[1], np.nan)
+
+    def _keep_failed(self, call: Callable[..., np.ndarray], parts: tuple[np.ndarray, ...]) -> None:
+        self.failed.append((call, *(part.copy() for part in parts)))  # whose memory is used again
 
     def _gradients(self, *parts: np.ndarray) -> np.ndarray:
         try:
@@ -241,6 +244,7 @@ class Simulator:
             if isinstance(self._grad, str) and not self.clock.gradients:
                 advice = f"write it with {self._grad} alone, or give grad=FUNCTION"
                 raise UserError(f"{self._grad} cannot differentiate the cost: {advice} ({reason})") from None
+            self._keep_failed(self.gradients, parts)
             self.gradient_error = self.gradient_error or reason
             self.n_failed_gradients += 1
             return np.full(parts[0].shape, np.nan)

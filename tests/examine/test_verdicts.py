@@ -100,6 +100,10 @@ def steps_of(x):
     return float(np.sin(x[0]) * x[1] + 2e-4 * np.floor(1000 * x[0] + 0.5))
 
 
+def rounded(x):
+    return np.round(20.0 * x) / 20.0
+
+
 def latent(x, w):
     """For each draw the cost is flat, and the mean over draws is not."""
     return float(np.mean(np.round(x[0] + w)) ** 2)
@@ -203,6 +207,9 @@ CASES = {
     "constant between jumps": (1, "staircase", lambda x: np.floor(20 * x[0]) / 20, None, {"theta": [1.01], "sigma": 0.1}),
     "a straight-through rounding": (1, "staircase", lambda x: float(np.round(8.0 * x[0]) / 8.0), lambda x: [1.0],
                                     {"theta": [0.3], "sigma": [0.01, 0.5], "calls": 8000}),
+    "a straight-through rounding beside a smooth input": (
+        1, "staircase", lambda x: float(rounded(x[0]) ** 2 + x[1] ** 2 * rounded(x[0])),
+        lambda x: [2 * rounded(x[0]) + x[1] ** 2, 2 * x[1] * rounded(x[0])], {"theta": [0.62, 0.8]}),
     "jumps off the grid of steps": (1, "", lambda x: x[0] + np.floor(1e4 * x[0]) / 1e4, lambda x: [1.0], {"theta": [1.00005]}),
     "a rounded latent": (1, "staircase", latent, lambda x, w: [0.0], {"theta": [0.3], "sigma": 0.3, "noise": 20, "calls": 8000}),
     "no draw moves the cost": (3, "constant", lambda x: 1.0 * (x[0] > 30), lambda x: [0.0], {"theta": [0.0], "sigma": 0.1}),
