@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from bench.examine.few import FewSteps
+from bench.examine.few import ROUNDS, FewSteps
 from bench.examine.lines import LineScan, scan
 from bench.examine.stages import GradientStages
 from bench.examine.steps import changing_loop
@@ -47,7 +47,7 @@ LOOSE, MOST_OF_IT, REFINED = 0.01, 0.6, 10.0
 """Relative error of a difference that shows too little, largest share of the remaining calls for a component's smooth part,
 and step of a refined cost's differences, in multiples of the cube root of the unit roundoff: it has a tolerance too."""
 SMOOTH = 2
-"""Components along which a cost is not rough that show it smooth, so that no other is searched."""
+"""Parts along which a cost is not rough that show it smooth, so that no other is searched."""
 GROWTH = 1.5
 """Least ratio of errors at the largest and at the first wrong number of steps that counts as growth."""
 
@@ -78,14 +78,20 @@ class Explanation:
     """A loop whose length depends on theta, as ``the loop at ode.py:17``; empty without one, None: not searched."""
     growth: Sequence[Horizon] = ()
     """The error of the gradient by number of steps."""
-    smooth_parts: Mapping[int, SmoothPart] = field(default_factory=dict)
-    """By component whose differences disagree with the gradient, or hardly agree: the slope of a rough cost's smooth part."""
+    smooth_parts: Mapping[str, SmoothPart | None] = field(default_factory=dict)
+    """By the name of a part whose differences disagree with the gradient, or hardly agree: the slope of a rough cost's smooth
+    part; None where the cost is not rough."""
     refined: np.ndarray | None = None
     """The slopes of :func:`refined_slopes`; None without a refined cost."""
     gradient_noise: float = 0.0
     """Noise of the gradient between neighbouring thetas, relative to its norm."""
     difference_step: str = ""
     """The step at which a difference of the cost is the gradient, ``1e-4, forward``; empty without one."""
+
+    @property
+    def wide(self) -> list[SmoothPart]:
+        """The known slopes of a rough cost's smooth part; empty for a cost that is not rough."""
+        return [one for one in self.smooth_parts.values() if one is not None]
 
 
 def refined_slopes(stages: GradientStages, other: Simulator) -> np.ndarray:
@@ -130,7 +136,7 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
         quick = FewSteps(
             space, costs, gradient, float(costs(stages.theta[:, None])[0]), simulator.unit, stages.repeats.spread
         )
-        quick.run_round(other.width)
+        quick.run_round(ROUNDS[0], other.width)
         outcome = quick.check()
         if not outcome.parts:
             continue
@@ -143,29 +149,34 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
     return result
 
 
-def doubtful(outcome: Check) -> list[Part]:
-    """Return the components that a rough cost may spoil: unequal, unsettled, or known to a hundredth only."""
+def doubtful(parts: Iterable[Part], groups: Collection[str]) -> list[Part]:
+    """Return components and groups that a rough cost may spoil: unequal, unsettled, or known to a hundredth only."""
     return [
         part
-        for part in outcome.components
-        if part.verdict in (*UNEQUAL, "unsettled")
-        or (part.verdict == "rounding" and CHANCE * part.uncertainty > LOOSE * abs(part.difference))
+        for part in parts
+        if (part.component is not None or part.name in groups)
+        and (
+            part.verdict in (*UNEQUAL, "unsettled")
+            or (part.verdict == "rounding" and CHANCE * part.uncertainty > LOOSE * abs(part.difference))
+        )
     ]
 
 
-def smooth_parts(stages: GradientStages, outcome: Check) -> dict[int, SmoothPart]:
-    """Return by component the slope of a rough cost's smooth part, for the doubtful components that the budget allows."""
-    random, found, n_smooth = np.random.default_rng([stages.seed, 0x776964]), {}, 0
-    for part in doubtful(outcome):
-        if n_smooth == SMOOTH or not stages.clock.can_afford(COSTS, share=MOST_OF_IT):
-            break
-        index = part.component or 0
-        direction = np.eye(1, stages.theta.size, index)[0]
-        one = smooth_part(partial(stages.costs_along, direction), part.sample.scale, stages.simulator.unit, random)
-        if one is not None:
-            found[index] = one
-        else:
-            n_smooth += 1
+def smooth_parts(stages: GradientStages, outcome: Check) -> dict[str, SmoothPart | None]:
+    """Return by name the slope of a rough cost's smooth part, for the doubtful parts that the budget allows."""
+    random, found = np.random.default_rng([stages.seed, 0x776964]), dict[str, SmoothPart | None]()
+    groups = {group.name: group for group in stages.groups}
+    for part in doubtful(outcome.parts, groups):
+        if list(found.values()).count(None) == SMOOTH:
+            found[part.name] = None
+        elif stages.clock.can_afford(COSTS, share=MOST_OF_IT):
+            direction, group = np.zeros(stages.theta.size), groups.get(part.name)
+            if group is None:
+                direction[part.component or 0] = 1.0
+            else:
+                direction[group.first : group.last] = group.vector
+            along = partial(stages.costs_along, direction)
+            found[part.name] = smooth_part(along, part.sample.scale, stages.simulator.unit, random)
     return found
 
 
@@ -194,8 +205,6 @@ def step_of_difference(stages: GradientStages, outcome: Check) -> str:
     index = [part.component or 0 for part in wrong]
     at = np.abs(stages.theta[index])
     for size, units in (("", np.ones_like(at)), (" max(1, |x|)", np.maximum(at, 1.0)), (" |x|", at)):
-        if (units == 1.0).all() and size:
-            continue
         steps = units[:, None] * DIFFERENCE_STEPS
         moved = np.zeros((stages.theta.size, 2, *steps.shape))
         moved[index, :, np.arange(len(index))] = np.stack([-steps, steps], axis=1)

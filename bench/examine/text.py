@@ -113,7 +113,7 @@ def warnings(report: Findings) -> list[str]:
         f"small error, within the tolerance: {''.join(map(report.numbers, small[:1]))}": small and report.derivative == RIGHT,
         f"zero: {', '.join(zeros[:MANY])}{' ...' * (len(zeros) > MANY)}": zeros and report.derivative_cause != "constant",
         **{f"{limit}: errors below about {100 * report.resolution:.1g}% are not seen": holds for limit, holds in limits.items()},
-        f"the gradient raised an exception {report.n_failed} times away from theta: {shortened(report.elsewhere)}": report.elsewhere,
+        f"the gradient raised an exception {report.n_failed} times away from theta: {shortened(report.error)}": report.n_failed and not report.is_failed,
         f"the cost is not a number or raises an exception, {report.place}": report.derivative_cause != "nonfinite" and report.place,
         **{f"{name} changes theta in place: each call gets a copy": True for name in report.changing},
         f"cost and gradient printed {counted(len(report.printed), 'line')}; the first: {shortened(''.join(report.printed[:1]))}": report.printed,
@@ -174,7 +174,7 @@ def again(report: Findings, setting: str) -> str:
 def write(report: Findings) -> str:
     """Return the whole report: the answers, what was checked, what to do next, and the tables."""
     noise = noise_problems(report)[1 if report.gradient else 0 :]
-    error, step = report.error or report.elsewhere, advice(report)
+    error, step = report.error, advice(report)
     unit = "on theta" if report.setup.levels else "of each input's scale"
     derivatives = [
         row

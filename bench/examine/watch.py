@@ -138,7 +138,7 @@ class Watch:
         if self._simulator is None:
             self._simulator = Simulator(self.cost, layout, noise=drawn.size)
         simulator, at, scale = self._simulator, layout.vector, layout.scales()
-        before = simulator.clock.costs
+        before = simulator.clock.counts["costs"]
 
         def costs(thetas: np.ndarray) -> np.ndarray:
             own = np.repeat(drawn[:, None], thetas.shape[1], axis=1) if drawn.size else None
@@ -150,8 +150,8 @@ class Watch:
         value, again = (float(costs(at[:, None])[0]) for _ in range(2))
         noise = abs(again - value)
         few = FewSteps(space, costs, slopes, value, simulator.unit, noise)
-        for _ in ROUNDS:
-            few.run_round(simulator.width)
+        for size in ROUNDS:
+            few.run_round(size, simulator.width)
         checked = few.check()
         row = {
             "cost": value, "gradient_norm": float(np.linalg.norm(slopes)), "verdict": checked.cause,
@@ -161,7 +161,7 @@ class Watch:
             has_moved = self._before.size == at.size and (self._before != at).any()
             step = at - self._before if has_moved else FIRST_STEP * scale
             row |= _pairs(costs, at, slopes, step, draw) | _along(costs, at, slopes, step, value, noise, simulator.unit)
-        return row | {"costs": simulator.clock.costs - before}
+        return row | {"costs": simulator.clock.counts["costs"] - before}
 
     @property
     def first(self) -> tuple[int, str] | None:
