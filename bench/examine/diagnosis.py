@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from bench.examine.few import FewSteps
+from bench.examine.few import ROUNDS, FewSteps
 from bench.examine.lines import LineScan, scan
 from bench.examine.stages import GradientStages
 from bench.examine.steps import changing_loop
@@ -33,12 +33,8 @@ FEWEST_JUMPS = 2
 """Fewest jumps on the lines that count as jumps of adaptive steps."""
 SPREADS = (0.0, 0.05, 0.1, 0.2, 0.4)
 """Distances from theta, in units of each input's scale, at which the loops of the program are compared."""
-ELSEWHERE = 2
-"""Number of other thetas at which the gradient is compared with a refined cost."""
-ALONG = 4
-"""Directions of these comparisons at each theta."""
-AROUND = 0.05
-"""Distance of these thetas, in units of each input's scale."""
+ELSEWHERE, AROUND = 2, 0.05
+"""Number of other thetas at which the gradient is compared with a refined cost, and their distance in units of the scales."""
 LONGER = 10.0
 """Length of the line on which more jumps are searched, in multiples of the first line."""
 DIFFERENCED, SAME = 4, 1e-3
@@ -51,7 +47,7 @@ LOOSE, MOST_OF_IT, REFINED = 0.01, 0.6, 10.0
 """Relative error of a difference that shows too little, largest share of the remaining calls for a component's smooth part,
 and step of a refined cost's differences, in multiples of the cube root of the unit roundoff: it has a tolerance too."""
 SMOOTH = 2
-"""Components along which a cost is not rough that show it smooth, so that no other is searched."""
+"""Parts along which a cost is not rough that show it smooth, so that no other is searched."""
 GROWTH = 1.5
 """Least ratio of errors at the largest and at the first wrong number of steps that counts as growth."""
 
@@ -72,15 +68,6 @@ class Horizon(NamedTuple):
         return self.error > tolerance + 2.0 * self.uncertainty
 
 
-class Gap(NamedTuple):
-    """At one theta, the distances of the gradient and of the cost's own differences from those of a refined cost."""
-
-    gradient: float
-    own: float
-    size: float
-    """Norm of the refined cost's differences."""
-
-
 @dataclass
 class Explanation:
     """What comparisons say about a wrong gradient."""
@@ -89,33 +76,42 @@ class Explanation:
     """Whether steps that depend on theta explain the error, by the jumps of the cost; None: not compared."""
     steps: str | None = None
     """A loop whose length depends on theta, as ``the loop at ode.py:17``; empty without one, None: not searched."""
-    gaps: Sequence[Gap] = ()
-    """At theta and at others: how far gradient and cost are from the refined cost; empty without a refined cost."""
     growth: Sequence[Horizon] = ()
     """The error of the gradient by number of steps."""
-    smooth_parts: Mapping[int, SmoothPart] = field(default_factory=dict)
-    """By component whose differences disagree with the gradient, or hardly agree: the slope of a rough cost's smooth part."""
-    refined: Mapping[int, float] = field(default_factory=dict)
-    """By component of these: the refined cost's difference."""
+    smooth_parts: Mapping[str, SmoothPart | None] = field(default_factory=dict)
+    """By the name of a part whose differences disagree with the gradient, or hardly agree: the slope of a rough cost's smooth
+    part; None where the cost is not rough."""
+    refined: np.ndarray | None = None
+    """The slopes of :func:`refined_slopes`; None without a refined cost."""
     gradient_noise: float = 0.0
     """Noise of the gradient between neighbouring thetas, relative to its norm."""
     difference_step: str = ""
     """The step at which a difference of the cost is the gradient, ``1e-4, forward``; empty without one."""
 
+    @property
+    def wide(self) -> list[SmoothPart]:
+        """The known slopes of a rough cost's smooth part; empty for a cost that is not rough."""
+        return [one for one in self.smooth_parts.values() if one is not None]
 
-def refined_gaps(stages: GradientStages, other: Simulator) -> list[Gap]:
-    """Return the gaps of a refined cost at theta and at other thetas around it, along a few random directions each."""
-    scale = stages.scale
-    random = np.random.default_rng([stages.seed, 0x676170])
-    eps, size, gaps = float(np.cbrt(stages.simulator.unit)), stages.theta.size, []
+
+def refined_slopes(stages: GradientStages, other: Simulator) -> np.ndarray:
+    """Return by theta the slopes by components that gradient, cost and refined cost have, ``(1 + ELSEWHERE, 3, m)``, theta first.
+
+    A slope is the change over the scale of an input.
+    """
+    index = [part.component or 0 for part in stages.check.components]
+    vectors = np.zeros((stages.theta.size, len(index)))
+    vectors[index, np.arange(len(index))] = stages.scale[index]
+    random, eps = np.random.default_rng([stages.seed, 0x676170]), float(np.cbrt(stages.simulator.unit))
+    rows = []
     for spread in (0.0, *[AROUND] * ELSEWHERE):
-        theta = stages.theta + spread * scale * random.standard_normal(size)
-        vectors = random.standard_normal((size, min(ALONG, size)))
-        vectors *= scale[:, None] / np.linalg.norm(vectors, axis=0)
-        own, exact = (stages.differences(theta, vectors, eps, one) for one in (stages.simulator, other))
-        slopes = stages.gradient_at(theta) @ vectors
-        gaps.append(Gap(*(float(np.linalg.norm(values)) for values in (slopes - exact, own - exact, exact))))
-    return gaps
+        theta = stages.theta + spread * stages.scale * random.standard_normal(stages.theta.size)
+        own, exact = (
+            stages.differences(theta, vectors, step, one)
+            for step, one in ((eps, stages.simulator), (REFINED * eps, other))
+        )
+        rows.append([stages.gradient_at(theta) @ vectors, own, exact])
+    return np.array(rows)
 
 
 def changing_steps(stages: GradientStages) -> str:
@@ -140,7 +136,7 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
         quick = FewSteps(
             space, costs, gradient, float(costs(stages.theta[:, None])[0]), simulator.unit, stages.repeats.spread
         )
-        quick.run_round(other.width)
+        quick.run_round(ROUNDS[0], other.width)
         outcome = quick.check()
         if not outcome.parts:
             continue
@@ -153,39 +149,35 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
     return result
 
 
-def doubtful(outcome: Check) -> list[Part]:
-    """Return the components that a rough cost may spoil: unequal, unsettled, or known to a hundredth only."""
+def doubtful(parts: Iterable[Part], groups: Collection[str]) -> list[Part]:
+    """Return components and groups that a rough cost may spoil: unequal, unsettled, or known to a hundredth only."""
     return [
         part
-        for part in outcome.components
-        if part.verdict in (*UNEQUAL, "unsettled")
-        or (part.verdict == "rounding" and CHANCE * part.uncertainty > LOOSE * abs(part.difference))
+        for part in parts
+        if (part.component is not None or part.name in groups)
+        and (
+            part.verdict in (*UNEQUAL, "unsettled")
+            or (part.verdict == "rounding" and CHANCE * part.uncertainty > LOOSE * abs(part.difference))
+        )
     ]
 
 
-def smooth_parts(stages: GradientStages, outcome: Check) -> dict[int, SmoothPart]:
-    """Return by component the slope of a rough cost's smooth part, for the doubtful components that the budget allows."""
-    random, found, n_smooth = np.random.default_rng([stages.seed, 0x776964]), {}, 0
-    for part in doubtful(outcome):
-        if n_smooth == SMOOTH or not stages.clock.can_afford(COSTS, share=MOST_OF_IT):
-            break
-        index = part.component or 0
-        direction = np.eye(1, stages.theta.size, index)[0]
-        one = smooth_part(partial(stages.costs_along, direction), part.sample.scale, stages.simulator.unit, random)
-        if one is not None:
-            found[index] = one
-        else:
-            n_smooth += 1
+def smooth_parts(stages: GradientStages, outcome: Check) -> dict[str, SmoothPart | None]:
+    """Return by name the slope of a rough cost's smooth part, for the doubtful parts that the budget allows."""
+    random, found = np.random.default_rng([stages.seed, 0x776964]), dict[str, SmoothPart | None]()
+    groups = {group.name: group for group in stages.groups}
+    for part in doubtful(outcome.parts, groups):
+        if list(found.values()).count(None) == SMOOTH:
+            found[part.name] = None
+        elif stages.clock.can_afford(COSTS, share=MOST_OF_IT):
+            direction, group = np.zeros(stages.theta.size), groups.get(part.name)
+            if group is None:
+                direction[part.component or 0] = 1.0
+            else:
+                direction[group.first : group.last] = group.vector
+            along = partial(stages.costs_along, direction)
+            found[part.name] = smooth_part(along, part.sample.scale, stages.simulator.unit, random)
     return found
-
-
-def refined_slopes(stages: GradientStages, other: Simulator, parts: Iterable[Part]) -> dict[int, float]:
-    """Return by component of some parts the central difference of the refined cost."""
-    index = [part.component for part in parts if part.component is not None]
-    vectors, scale = np.zeros((stages.theta.size, len(index))), stages.scale[index]
-    vectors[index, np.arange(len(index))] = scale
-    step = float(np.cbrt(stages.simulator.unit)) * REFINED
-    return dict(zip(index, stages.differences(stages.theta, vectors, step, other) / scale, strict=True))
 
 
 @np.errstate(all="ignore")
@@ -213,8 +205,6 @@ def step_of_difference(stages: GradientStages, outcome: Check) -> str:
     index = [part.component or 0 for part in wrong]
     at = np.abs(stages.theta[index])
     for size, units in (("", np.ones_like(at)), (" max(1, |x|)", np.maximum(at, 1.0)), (" |x|", at)):
-        if (units == 1.0).all() and size:
-            continue
         steps = units[:, None] * DIFFERENCE_STEPS
         moved = np.zeros((stages.theta.size, 2, *steps.shape))
         moved[index, :, np.arange(len(index))] = np.stack([-steps, steps], axis=1)

@@ -32,7 +32,7 @@ from bench.examine.smoothing import (
 from bench.examine.stages import GradientStages
 from bench.gradient import Check
 from bench.gradient.rules import RULES, SUSPICIOUS
-from bench.simulator.clock import Clock, OutOfTime, parse_duration
+from bench.simulator.clock import KINDS, Clock, OutOfTime, parse_duration
 from bench.simulator.simulator import Simulator
 from bench.simulator.tree import ParameterTree
 
@@ -238,24 +238,23 @@ def _function_name(function: Any) -> str:
 class _Examination:
     def __init__(self, simulator: Simulator, setup: Setup) -> None:
         self.simulator, self.setup, self.clock = simulator, setup, simulator.clock
-        self.left_out: list[str] = []
         self.explained = diagnosis.Explanation()
         self.means: Mean | None = None
         self._near: list[LineScan] | None = None
         """Lines at theta that do not depend on sigma."""
         self.stages = GradientStages(simulator, setup.scale, setup.seed, bool(setup.levels))
+        self.left_out = self.stages.left_out
 
     def run(self, named: Mapping[str, Any], refined: Any) -> Report:
         """Run the checks that the budget allows, the decisive ones first, and return the report."""
         simulator, clock, stages, setup, explained = self.simulator, self.clock, self.stages, self.setup, self.explained
         stages.run(self._compare_early)
-        self.left_out += stages.left_out
         checked = stages.check
         is_wrong = checked.cause in SUSPICIOUS
         has_gradient = stages.gradient is not None
         self._find_smooth_parts(checked)
-        if refined is not None and has_gradient and (is_wrong or explained.smooth_parts):
-            self._compare_refined(refined, checked, is_wrong)
+        if refined is not None and has_gradient and (is_wrong or explained.wide):
+            self._compare_refined(refined)
         if setup.horizons:
             self._explain("growth", "horizons", diagnosis.errors_by_horizon, setup.horizons)
         if is_wrong and has_gradient:
@@ -267,6 +266,7 @@ class _Examination:
             explained.is_adaptive = self._compare_along_lines(checked, 0.9)
         lines = self._scan_lines(checked) if can_go_on else []
         smoothed = self._measure_noise(checked, lines) if can_go_on else []
+        stages.repeat_failures()
         return Report(
             **named,
             layout=simulator.layout,
@@ -276,9 +276,8 @@ class _Examination:
             repeats=stages.repeats,
             setup=setup,
             spent=Spent(
-                clock.costs, clock.gradients, clock.spent, clock.compile_s, clock.elapsed, clock.per_cost(),
-                clock.per_gradient(),
-                clock.budget, clock.calls,
+                *(clock.counts[kind] for kind in KINDS), clock.spent, clock.compile_s, clock.elapsed,
+                *(clock.seconds_per(kind) for kind in KINDS), clock.budget, clock.calls,
             ),
             check=checked,
             is_complete=stages.is_complete,
@@ -290,14 +289,14 @@ class _Examination:
             means=self.means,
             lines=lines,
             smoothed=smoothed,
-            error=simulator.gradient_error if stages.is_failed else "",
-            elsewhere=simulator.gradient_error if not stages.is_failed else "",
-            n_failed=simulator.n_failed_gradients,
+            error=next(iter(simulator.raised["gradients"]), ""),
+            is_failed=stages.is_failed,
+            n_failed=simulator.raised["gradients"].total(),
             printed=simulator.printed.getvalue().splitlines(),
             changing=sorted(simulator.changing),
             notes=[
                 *simulator.notes,
-                *(f"the cost raised {n} times: {text}" for text, n in list(simulator.raised.items())[:3]),
+                *(f"the cost raised {n} times: {text}" for text, n in simulator.raised["costs"].most_common(3)),
             ],
             left_out=self.left_out,
             enough=self._enough(),
@@ -335,13 +334,11 @@ class _Examination:
         if found is not None:
             setattr(self.explained, name, found)
 
-    def _compare_refined(self, refined: Any, checked: Check, is_wrong: bool) -> None:
+    def _compare_refined(self, refined: Any) -> None:
         """Compare gradient and cost with a refined cost, whose program is compiled once."""
         other = self._attempt("the refined cost", lambda: self.simulator.variant(refined))
-        if other is not None and is_wrong:
-            self._explain("gaps", "the refined cost", diagnosis.refined_gaps, other)
-        if other is not None and self.explained.smooth_parts:
-            self._explain("refined", "the refined cost", diagnosis.refined_slopes, other, diagnosis.doubtful(checked))
+        if other is not None:
+            self._explain("refined", "the refined cost", diagnosis.refined_slopes, other)
 
     # ------------------------------------------------------------------------------------------------ lines
 
@@ -359,7 +356,7 @@ class _Examination:
             self.means = self._attempt("the mean over draws", lambda: compare_means(self.stages), MEANS_SHARE)
 
     def _find_smooth_parts(self, checked: Check) -> None:
-        if self.stages.gradient is not None and not self.explained.smooth_parts and diagnosis.doubtful(checked):
+        if self.stages.gradient is not None and not self.explained.wide:
             self._explain("smooth_parts", "the smooth part of the cost", diagnosis.smooth_parts, checked)
 
     def _compare_along_lines(self, checked: Check, share: float) -> bool | None:

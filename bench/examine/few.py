@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from bench.examine.subspace import Subspace
-from bench.gradient.causes import causes_of_ratios
 from bench.gradient.check import NOTHING, Check, Part, cause_of
 from bench.gradient.direction import ALIKE, MEASURED, Sample, finding_at, resolution, wrong
 
@@ -44,21 +43,18 @@ class FewSteps:
     unit: float
     floor: float = 0.0
     """Largest difference between equal calls of the cost."""
-    rounds: int = 0
-    """Number of finished rounds."""
     values: dict[int, list[tuple[float, float, float]]] = field(default_factory=lambda: defaultdict(list))
     """Step and costs on both sides, by coordinate."""
 
-    def run_round(self, width: int = 1) -> None:
-        """Compute two costs per coordinate at the next step, at most ``width`` costs per call."""
-        steps, size = ROUNDS[self.rounds] * float(np.cbrt(self.unit)) * self.space.scale, self.space.size
+    def run_round(self, step: float, width: int = 1) -> None:
+        """Compute two costs per coordinate at one of :data:`ROUNDS`, at most ``width`` costs per call."""
+        steps, size = step * float(np.cbrt(self.unit)) * self.space.scale, self.space.size
         for chosen in np.array_split(np.arange(size), -(-size // max(width // 2, 1))):
             moved = np.zeros((size, 2 * chosen.size))
             moved[np.tile(chosen, 2), np.arange(2 * chosen.size)] = np.r_[-steps[chosen], steps[chosen]]
             costs = self.cost(self.space.place(moved)).reshape(2, -1)
             for index, minus, plus in zip(chosen, *costs, strict=True):
                 self.values[int(index)].append((float(steps[index]), float(minus), float(plus)))
-        self.rounds += 1
 
     def check(self) -> Check:
         """Return the outcome for the coordinates with at least one difference."""
@@ -66,11 +62,6 @@ class FewSteps:
         parts = [self._part(i, float(gradient[i])) for i in sorted(self.values)]
         if not parts:
             return NOTHING
-        ratios = {i: [part.ratio_with_error] for i, part in enumerate(parts) if part.verdict == "wrong_adjoint"}
-        if ratios:
-            causes = causes_of_ratios(ratios, [], any(part.verdict == "smooth" for part in parts))
-            if set(causes.values()) == {"wrong_factor"}:
-                parts = [replace(p, verdict="wrong_factor") if i in ratios else p for i, p in enumerate(parts)]
         return self.space.restore(Check(cause_of(parts), tuple(parts), ()))
 
     @np.errstate(all="ignore")
@@ -92,7 +83,9 @@ class FewSteps:
             uncertainty = min(uncertainty, float(others.min() + noise[best]))
         if self.gradient is None:
             sample = replace(sample, derivative=difference)
-        is_contradicted = bool((np.abs(sample.differences - difference) > bounds + uncertainty).any())
+        # in chaos, slopes at smaller steps bend by more than the slope
+        is_bent = (bounds - 2.0 * noise)[best + 1 :] > abs(difference) + uncertainty
+        is_contradicted = bool((np.abs(sample.differences - difference) > bounds + uncertainty).any() or is_bent.any())
         finding = finding_at(sample, _judge(sample, difference, uncertainty, is_contradicted), best, uncertainty)
         return Part(name=f"component {index}", component=index, sample=sample, **vars(finding))
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.errors import needing_sweeps
-from bench.examine.diagnosis import LOOSE, Explanation, grows, may_be_adaptive
+from bench.examine.diagnosis import LOOSE, Explanation, doubtful, grows, may_be_adaptive
 from bench.examine.hints import Hint, hint_of
 from bench.examine.lines import ALIKE, LineScan
 from bench.examine.means import OF_A_DRAW, Mean
@@ -19,7 +19,7 @@ from bench.examine.smoothing import TARGET_ERROR, Method, Smoothed
 from bench.examine.stages import Repeats, recaused
 from bench.examine.subspace import MOST
 from bench.gradient import FAULTS, TRUSTED, Check, Part, Sample, rules
-from bench.gradient.direction import CHANCE, resolution
+from bench.gradient.direction import CHANCE, MIN_STEPS, resolution
 from bench.gradient.roughness import FINE
 from bench.gradient.rules import EXCUSABLE, RULES, STATUS, SUSPICIOUS, UNEQUAL
 from bench.gradient.smooth_part import LIMIT
@@ -51,6 +51,8 @@ AS_FAR = 4.0
 """Largest such distance over all thetas together where the steps depend on theta, so that the gradient has its own error."""
 RESIDUE = 1e-4
 """Largest change of the cost by a gradient, relative to the height of a jump, that is a residue of a solver."""
+TINY = 1e-8
+"""Scale of an input below which a slope that no difference shows counts, however small its change of the cost over the scale."""
 SHOWN = 8
 """Most numbers of theta in the table of breaks."""
 ROUGH = 0.1
@@ -200,9 +202,9 @@ class Findings:
     lines: Sequence[LineScan]
     smoothed: Sequence[Smoothed]
     error: str
-    """The exception that the gradient at theta raised; empty if none."""
-    elsewhere: str
-    """The exception that the gradient raised at another theta; empty if none."""
+    """The first exception that the gradient raised; empty if none."""
+    is_failed: bool
+    """Whether it did at theta."""
     n_failed: int
     """Number of gradient calls that raised an exception."""
     printed: Sequence[str]
@@ -246,7 +248,7 @@ class Findings:
     @cached_property
     def judged(self) -> Check:
         """The check with derivatives of a rough cost judged by its smooth part."""
-        if not self.explained.smooth_parts or self.tread or self._is_rough:
+        if not self.explained.wide or self.tread or self._is_rough:
             return self.check
         return recaused(self.check, self._of_smooth_part)
 
@@ -263,34 +265,45 @@ class Findings:
             for one in samples
         )
 
+    @cached_property
+    def _refined(self) -> dict[str, float]:
+        """The refined cost's derivatives by component; empty without a refined cost."""
+        slopes = [] if self.explained.refined is None else self.explained.refined[0, 2]
+        return {p.name: float(one) / p.sample.scale for p, one in zip(self.check.components, slopes, strict=False)}
+
     def _of_smooth_part(self, part: Part) -> Part:
         """Return a part of a rough cost with the verdict that wide steps, or a refined cost, give.
 
-        Directions and other thetas were compared at tiny steps only, which show nothing there.
+        Random directions of all numbers and other thetas were compared at tiny steps only, which show nothing there.
         """
         explained, is_open = self.explained, part.verdict in (*UNEQUAL, "unsettled")
-        if part.component is None:
+        group, index = self.groups.get(part.name), part.component
+        if index is None and group is None:
             return replace(part, verdict="smooth_part") if is_open or part.verdict in rules.BROKEN else part
-        wide, refined = explained.smooth_parts.get(part.component), explained.refined.get(part.component)
-        if wide is None and refined is None:
+        wide, refined = explained.smooth_parts.get(part.name), self._refined.get(part.name)
+        is_known = wide is refined is None and (part.name in explained.smooth_parts or not is_open)
+        if is_known or not doubtful([part], self.groups):
             return part
         slope, error = (part.difference, math.inf) if wide is None else (wide.slope, wide.error)
         if refined is not None:
             size = max(abs(refined), abs(part.program))
             slope, error = refined, min(abs(slope - refined) + error, LOOSE * size)
-        size, apart = max(abs(slope), abs(part.program)), abs(part.program - slope)
-        tolerance = max(float(self.setup.rtol[part.component]), resolution(self.unit))
-        is_rough = any(each.error > tolerance * abs(each.slope) for each in explained.smooth_parts.values())
-        if refined is None and is_rough and error <= tolerance * size:
-            error = LOOSE * size  # of one sequence of steps, whose changes other components show
+        # the slope along a random direction may be 0 by chance
+        size = max(abs(slope), abs(part.program), group.slope / math.sqrt(group.count) if group else 0.0)
+        rtol, atol = (0.0, group.tolerated) if group else (self.setup.rtol[index], self.setup.atol[index])
+        tolerance, apart = max(float(rtol), resolution(self.unit)), abs(part.program - slope)
+        allowed = tolerance * size + float(atol)
+        is_rough = any(each.error > tolerance * abs(each.slope) for each in explained.wide)
+        if refined is None and is_rough and error <= allowed:
+            error = LOOSE * size  # of one sequence of steps, whose changes other parts show
         if error > LIMIT * size:
             verdict = "unsettled"
-        elif apart > error + tolerance * size + float(self.setup.atol[part.component]):
+        elif apart > error + allowed:
             if not is_open and abs(part.program - part.difference) <= 2.0 * part.uncertainty:
                 return part  # right of one sequence of steps
             verdict = part.verdict if part.verdict in UNEQUAL else "wrong_adjoint"
         else:
-            verdict = "smooth_part" if error <= tolerance * size or refined is not None else "coarse"
+            verdict = "smooth_part" if error <= allowed or refined is not None else "coarse"
         return replace(part, verdict=verdict, difference=slope, uncertainty=error)
 
     @cached_property
@@ -329,12 +342,17 @@ class Findings:
         """The components that the check accepts, though differences cannot see them or contradict them.
 
         A component is seen if its difference has one correct digit, compared with the derivative or with the slopes of
-        wider steps, which are not 0 at a minimum. Unseen components that are small beside the seen ones do not count.
+        wider steps, which are not 0 at a minimum. Unseen components that are small beside the seen ones do not count, unless
+        their input is so small that it need not be its own scale.
         """
         parts = [p for p in self.settled.components if p.verdict in TRUSTED and p.verdict != "zero"]
         seen = [p for p in parts if p.uncertainty < DIGIT * max(abs(p.difference), _slope_nearby(p.sample))]
         largest = max((abs(p.difference) * p.sample.scale for p in seen), default=0.0)
-        hidden = [p for p in parts if p not in seen and abs(p.program) * p.sample.scale >= DIGIT * largest]
+        hidden = [
+            p
+            for p in parts
+            if p not in seen and (abs(p.program) * p.sample.scale >= DIGIT * largest or p.sample.scale < TINY)
+        ]
         contradicted = [
             p
             for p in seen
@@ -394,7 +412,7 @@ class Findings:
         """Yield each verdict about the derivative at theta, whether it holds, and its facts: the first that holds decides."""
         repeats = self.repeats
         yield "nondeterministic", repeats.is_failing, "equal calls raise an exception or return a number"
-        yield "raised", bool(self.error), shortened(self.error)
+        yield "raised", self.is_failed, shortened(self.error)
         yield "undecided", not self.check.parts, self.n_checked
         yield "nondeterministic", repeats.is_large, self.spread_text
         if self.wrong_checks:
@@ -407,10 +425,11 @@ class Findings:
         is_of_a_draw = self.is_random and failed in OF_A_DRAW and not self._is_of_draws
         is_suspicious = failed in SUSPICIOUS
         yield self._cause_of_mean, is_of_a_draw, self.mean_text
-        yield "staircase", is_suspicious and (self._is_residue or self.has_steps), numbers
+        yield "staircase", is_suspicious and (self._is_on_tread or self.has_steps), numbers
         yield "rough", failed == "unsettled" and self._is_rough, ""
-        yield "adaptive", failed == "unsettled" and bool(explained.smooth_parts), numbers
-        is_gap = failed in EXCUSABLE and not explained.refined and self.is_discretisation_gap
+        yield "adaptive", failed == "unsettled" and bool(explained.wide), numbers
+        is_decided = bool(explained.wide) and explained.refined is not None
+        is_gap = failed in EXCUSABLE and not is_decided and self.is_discretisation_gap
         loop = f", {explained.steps} has another length at other thetas" * bool(explained.steps)
         yield "adaptive", is_gap, f"{numbers}{loop}"
         is_grown = grows(explained.growth, self._tolerance_of_horizons)
@@ -418,7 +437,7 @@ class Findings:
         is_falling = self.hint is not None and self.hint.cause == "continuous_adjoint"
         yield "continuous_adjoint", is_falling and is_suspicious, numbers
         # so small an error that adaptive steps may explain it, and the budget ended before that was known
-        is_open = explained.is_adaptive is None and not explained.gaps and may_be_adaptive(self.check)
+        is_open = explained.is_adaptive is None and explained.refined is None and may_be_adaptive(self.check)
         yield "undecided", is_open and is_suspicious, f"{numbers}: adaptive steps may explain it"
         yield "unresolved", is_suspicious and self._is_slight, numbers
         yield failed, True, numbers
@@ -511,7 +530,7 @@ class Findings:
     def can_refine(self) -> bool:
         """Whether a refined cost can show that the error is one of the discretisation."""
         explained = self.explained
-        return bool(explained.smooth_parts or explained.steps) or may_be_adaptive(self.check)
+        return bool(explained.wide or explained.steps) or may_be_adaptive(self.check)
 
     @property
     def _failed_numbers(self) -> str:
@@ -560,12 +579,14 @@ class Findings:
         return "".join(f"its mean is off by {span(*one.bias_percent)}%, at sigma {one.sigma:g}" for one in known[:1])
 
     @property
-    def _is_residue(self) -> bool:
-        """Whether the gradient is a residue beside the jumps of a cost that is constant around theta."""
-        wrong = [part for part in self.check.parts if part.verdict in SUSPICIOUS]
+    def _is_on_tread(self) -> bool:
+        """Whether the cost is constant at the smallest steps beside jumps: wider steps meet them, or the gradient is a residue."""
+        parts = self.check.components or self.check.parts
+        wrong = [part for part in parts if part.verdict in (*SUSPICIOUS, "unsettled")]
         height = max((jump.size for line in self.lines for jump in line.jumps), default=0.0)
-        return bool(wrong) and all(
-            not part.sample.differences.any() and abs(part.program) * part.sample.scale <= RESIDUE * height
+        return bool(height and wrong) and all(
+            not part.sample.differences[-MIN_STEPS:].any()
+            and (part.sample.differences.any() or abs(part.program) * part.sample.scale <= RESIDUE * height)
             for part in wrong
         )
 
@@ -589,13 +610,12 @@ class Findings:
         Either the gradient agrees with a refined cost where the cost's own differences do not, at every theta compared. Or
         the steps depend on theta, and the error is of the size of the jumps that this makes, or of a refined cost's gap.
         """
-        explained = self.explained
-        if not explained.gaps:
-            return bool(explained.steps and explained.is_adaptive)
-        if all(gap.gradient <= AGREES * gap.own for gap in explained.gaps):
-            return True
-        gradient, own, _ = np.linalg.norm(explained.gaps, axis=0)
-        return bool(explained.steps) and bool(gradient <= AS_FAR * own)
+        refined, is_varied = self.explained.refined, bool(self.explained.steps)
+        if refined is None:
+            return is_varied and bool(self.explained.is_adaptive)
+        gradient, own = np.linalg.norm(refined[:, :2] - refined[:, 2:], axis=2).T
+        is_far = np.linalg.norm(gradient) > AS_FAR * np.linalg.norm(own)
+        return bool((gradient <= AGREES * own).all() or (is_varied and not is_far))
 
     @property
     def derivative(self) -> str:

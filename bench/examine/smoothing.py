@@ -17,7 +17,7 @@ from statistics import NormalDist
 import numpy as np
 
 from bench.examine.lines import REACH, LineScan
-from bench.simulator.clock import OutOfTime
+from bench.simulator.clock import KINDS, OutOfTime
 from bench.simulator.simulator import Simulator
 
 PAIRS = 4096
@@ -225,7 +225,7 @@ def _summary(
         moved = float(np.linalg.norm(truth - weight[:, 0] * plain))
     methods: list[Method] = []
     if norm > CLEAR * error:
-        each, slope = simulator.clock.per_cost(), simulator.clock.per_gradient()
+        each, slope = map(simulator.clock.seconds_per, KINDS)
         methods.append(_method("smoothing", (0.0, 0.0), terms, norm, 2, each))
         if plain is not None:
             ends = max(moved - 2.0 * error, 0.0), max(moved + 2.0 * error, float(jumps))

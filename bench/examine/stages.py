@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from bench.examine.few import ROUNDS, FewSteps, is_nothing
-from bench.examine.subspace import Group, Subspace, choose, count_of, locate
+from bench.examine.subspace import Group, Subspace, choose, count_of, in_parts, locate
 from bench.gradient import EPS, FAULTS, TRUSTED, Check, Options, Part, check, step_sizes
 from bench.gradient.check import ELSEWHERE, NOTHING, cause_of
 from bench.simulator.clock import OutOfTime
@@ -121,15 +121,19 @@ class GradientStages:
         w = self.w if w is None else w
         return None if w is None else np.repeat(w, count, axis=1)
 
-    def thetas_along(self, direction: np.ndarray, t: np.ndarray) -> Iterator[np.ndarray]:
-        """Yield the thetas at theta + t * direction for ``t (n,)``, a batch at a time, since memory holds few large ones."""
-        width = max(self.simulator.width, 1)
-        for first in range(0, t.size, width):
-            yield self.theta[:, None] + direction[:, None] * t[first : first + width]
-
     def costs_along(self, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Return the costs ``(n,)`` at theta + t * direction for t of n numbers."""
-        return np.concatenate([self.costs(thetas) for thetas in self.thetas_along(direction, t.ravel())])
+        return self._along(self.costs, direction, t)
+
+    def slopes_along(self, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Return the program's derivatives ``(n,)`` along a direction at theta + t * direction for t of n numbers."""
+        return self._along(lambda thetas: direction @ self.gradients(thetas), direction, t)
+
+    def _along(self, function: Callable[[np.ndarray], np.ndarray], direction: np.ndarray, t: np.ndarray) -> np.ndarray:
+        def at(part: np.ndarray) -> np.ndarray:
+            return function(self.theta[:, None] + direction[:, None] * part)
+
+        return in_parts(at, t.ravel(), self.simulator.width)
 
     def differences(
         self, theta: np.ndarray, vectors: np.ndarray, step: float, simulator: Simulator | None = None
@@ -139,20 +143,24 @@ class GradientStages:
         costs = (simulator or self.simulator).costs(thetas, self.same_noise(thetas.shape[1]))
         return np.asarray(np.subtract(*np.split(costs, 2)) / (2.0 * step))
 
-    def gradient_at(self, theta: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
+    def gradients(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
+        """Return the simulator's gradients at ``thetas (d, B)``, all under the same draw of its own noise."""
+        return self.simulator.gradients(thetas, self.same_noise(thetas.shape[1], w))
+
+    def gradient_at(self, theta: np.ndarray) -> np.ndarray:
         """Return the simulator's gradient at ``theta (d,)``."""
-        return self.simulator.gradients(theta[:, None], self.same_noise(1, w))[:, 0]
+        return self.gradients(theta[:, None])[:, 0]
 
     def _costs_in(self, space: Subspace, w: np.ndarray | None, z: np.ndarray) -> np.ndarray:
         """Return the costs ``(B,)`` at coordinates ``z (m, B)``."""
-        costs = space.costs(partial(self.costs, w=w), z, self.simulator.width)
+        costs = in_parts(lambda part: self.costs(space.place(part), w), z, self.simulator.width)
         apart = [self._apart(w, column, cost) for column, cost in zip(z.T, costs, strict=True)]
         self.repeats.spread = max(self.repeats.spread, *apart)
         return costs
 
     def _gradient_in(self, space: Subspace, w: np.ndarray | None, z: np.ndarray) -> np.ndarray:
         """Return the derivatives by the coordinates of a space at ``z (m,)``, ``(m,)``."""
-        gradient = space.project(self.gradient_at(space.place(z[:, None])[:, 0], w))
+        gradient = space.project(self.gradients(space.place(z[:, None]), w)[:, 0])
         size = float(np.linalg.norm(gradient))
         apart = self._apart(w, z, gradient) / size if size else 0.0
         self.repeats.of_gradient = max(self.repeats.of_gradient, apart)
@@ -163,13 +171,6 @@ class GradientStages:
         key = z.tobytes(), b"" if w is None else w.tobytes(), str(np.ndim(value)).encode()
         return float(np.nan_to_num(np.abs(self._before.setdefault(key, value) - value)).max())
 
-    def slopes_along(self, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Return the program's derivatives ``(n,)`` along a direction at theta + t * direction for t of n numbers."""
-        return np.concatenate([
-            direction @ self.simulator.gradients(thetas, self.same_noise(thetas.shape[1]))
-            for thetas in self.thetas_along(direction, t)
-        ])  # fmt: skip
-
     # ------------------------------------------------------------------------------------------------ stages
 
     def run(self, explain: Callable[[Check], None]) -> None:
@@ -178,21 +179,15 @@ class GradientStages:
             self._start()
         if self.left_out:
             return
-        with self.clock.stage("calls that raised an exception, once more", self.left_out):
-            self._repeat_failures()
-            if self.is_failed:
-                return
+        self.repeat_failures()
+        if not self.is_failed:
             self._run_stages(explain)
-            self._repeat_failures()
 
-    def _repeat_failures(self) -> None:
+    def repeat_failures(self) -> None:
         """Repeat calls that raised an exception, which may do so at random."""
-        if self.is_failed:
-            again = self.gradient_at(self.theta)
-            self.repeats.is_failing |= bool(np.isfinite(again).all())
-        for at, *w in list(self.simulator.failed):
-            again = self.simulator.costs(at, *w)
-            self.repeats.is_failing |= bool(np.isfinite(again).any())
+        with self.clock.stage("calls that raised an exception, once more", self.left_out):
+            for kind, *parts in list(self.simulator.failed):
+                self.repeats.is_failing |= bool(np.isfinite(getattr(self.simulator, kind)(*parts)).any())
 
     def _run_stages(self, explain: Callable[[Check], None]) -> None:
         space = choose(self.layout, self.scale, self.gradient, self.seed)
@@ -219,7 +214,7 @@ class GradientStages:
         if not simulator.has_gradient:
             return
         gradient = self.gradient_at(self.theta)
-        self.is_failed = simulator.n_failed_gradients > 0
+        self.is_failed = bool(simulator.raised["gradients"])
         if not self.is_failed:
             self.gradient = gradient
 
@@ -227,8 +222,8 @@ class GradientStages:
         """Compare the gradient with two costs per coordinate, and with more where the full steps do not fit."""
         quick = FewSteps(space, self.costs, self.gradient, self.value, self.simulator.unit, self.repeats.spread)
         try:
-            for _ in ROUNDS:
-                quick.run_round(self.simulator.width)
+            for step in ROUNDS:
+                quick.run_round(step, self.simulator.width)
                 if self.clock.can_afford(*self._cost_of(self._options(space.size), space.size), share=SHARE):
                     break
         finally:
@@ -258,12 +253,12 @@ class GradientStages:
             self.repeats.has_state = bool(max(np.ptp(after_theta), np.ptp(after_other)) <= apart)
 
     def _repeat_gradient(self, other: np.ndarray) -> None:
-        """Compare the gradient with that of an equal call after one at ``other (d,)``."""
+        """Compare the gradient with that of an equal call after one at ``other (d,)``, or in a batch with it."""
         if self.gradient is None or not np.isfinite(self.gradient).all():
             return
         with self.clock.stage("repeating a gradient", self.left_out):
-            self.gradient_at(other)
-            again, size = self.gradient_at(self.theta), float(np.linalg.norm(self.gradient))
+            _, again = self.gradients(np.stack([other, self.theta], axis=1)).T
+            size = float(np.linalg.norm(self.gradient))
             if size and np.isfinite(again).all():
                 self.repeats.of_gradient = float(np.linalg.norm(again - self.gradient)) / size
 
@@ -364,7 +359,7 @@ class GradientStages:
         is_own = any(part.verdict == "nondeterministic" for part in outcome.parts)
         if is_own and options.repeated and not self.repeats.is_large and self.repeats.spread > 0.0:
             return self._check_once(space, replace(options, repeated=False), w)
-        if self.simulator.n_failed_gradients:
+        if self.simulator.raised["gradients"]:
             # a gradient that raises at other thetas is reported as such
             outcome = replace(outcome, draws=tuple(part for part in outcome.draws if np.isfinite(part.program)))
             outcome = recaused(outcome)
@@ -394,11 +389,11 @@ class GradientStages:
         assert self.gradient is not None
         space = Subspace(self.layout, self.scale, [index], [])
         quick = FewSteps(space, self.costs, self.gradient, self.value, self.simulator.unit, self.repeats.spread)
-        for _ in ROUNDS:
-            quick.run_round()
+        for step in ROUNDS:
+            quick.run_round(step)
         outcome = quick.check()
         if outcome.cause in FAULTS:
-            added = replace(outcome.parts[0], verdict=verdict)
+            added = replace(outcome.parts[0], verdict=verdict, name=f"number {index}")
             self.check = replace(self.check, parts=(added, *self.check.parts))
 
     def _check_under_other_noise(self) -> None:

@@ -65,11 +65,6 @@ class Subspace:
         along = [float(group.vector @ gradient[group.first : group.last]) for group in self.groups]
         return np.r_[gradient[self.components], along]
 
-    def costs(self, cost: Callable[[np.ndarray], np.ndarray], z: np.ndarray, width: int) -> np.ndarray:
-        """Return the costs ``(B,)`` at ``z (m, B)``, from ``cost`` of at most ``width`` thetas ``(d, width)`` at a time."""
-        parts = [z[:, first : first + width] for first in range(0, z.shape[1], width)]
-        return np.concatenate([np.zeros(0), *(cost(self.place(part)) for part in parts)])
-
     def restore(self, check: Check) -> Check:
         """Return a check in these coordinates with its parts named after theta's components and groups."""
         return replace(check, parts=tuple(self._restore_part(part) for part in check.parts))
@@ -80,6 +75,12 @@ class Subspace:
         if part.component < len(self.components):
             return replace(part, component=self.components[part.component])
         return replace(part, component=None, name=self.groups[part.component - len(self.components)].name)
+
+
+def in_parts(function: Callable[[np.ndarray], np.ndarray], z: np.ndarray, width: int) -> np.ndarray:
+    """Return ``function(z)``, ``(B,)``, for ``z (..., B)``, ``width`` columns at a time, since memory holds few large thetas."""
+    parts = (z[..., first : first + width] for first in range(0, max(z.shape[-1], 1), width))
+    return np.concatenate([function(part) for part in parts])
 
 
 def count_of(dim: int) -> int:

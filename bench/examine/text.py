@@ -7,6 +7,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from bench.examine.findings import FAILED, NONE, RIGHT, SEEN, Findings, as_text, shortened
 from bench.examine.lines import REACH
 from bench.examine.smoothing import PAIRS
@@ -65,8 +67,10 @@ def noise_answer(report: Findings) -> str:
         usable = [setup.shown(one.sigma) for one in report.smoothed if one.is_usable and cause != "nan_gradient"]
         fact = f". {noise_problems(report)[0]}" + f"; usable at sigma {', '.join(usable)}" * bool(usable)
     elif report.use == "usable":
-        bounds = [max(one.bias_percent[1], 100 * one.unseen / one.norm) for one in known]
-        fact = f". The bias of the mean gradient is below {number(max(bounds, default=0.0))}%"
+        bounds = [(one.bias_percent[1], 100 * one.unseen / one.norm) for one in known]
+        bias, unseen = np.max(bounds, axis=0, initial=0.0).tolist()
+        fact = f". The bias of the mean gradient is below {number(bias)}%"
+        fact += f", and an event that no draw met may add {number(unseen)}%"
     where = (
         f"Under noise of sigma {', '.join(map(setup.shown, levels))}"
         if levels
@@ -109,7 +113,7 @@ def warnings(report: Findings) -> list[str]:
         f"small error, within the tolerance: {''.join(map(report.numbers, small[:1]))}": small and report.derivative == RIGHT,
         f"zero: {', '.join(zeros[:MANY])}{' ...' * (len(zeros) > MANY)}": zeros and report.derivative_cause != "constant",
         **{f"{limit}: errors below about {100 * report.resolution:.1g}% are not seen": holds for limit, holds in limits.items()},
-        f"the gradient raised an exception {report.n_failed} times away from theta: {shortened(report.elsewhere)}": report.elsewhere,
+        f"the gradient raised an exception {report.n_failed} times away from theta: {shortened(report.error)}": report.n_failed and not report.is_failed,
         f"the cost is not a number or raises an exception, {report.place}": report.derivative_cause != "nonfinite" and report.place,
         **{f"{name} changes theta in place: each call gets a copy": True for name in report.changing},
         f"cost and gradient printed {counted(len(report.printed), 'line')}; the first: {shortened(''.join(report.printed[:1]))}": report.printed,
@@ -122,7 +126,7 @@ def warnings(report: Findings) -> list[str]:
 def advice(report: Findings) -> str:
     """Return the next step, and on lines of their own the commands with the settings that take it."""
     cause, explained = report.cause, report.explained
-    has_refined = bool(explained.gaps)
+    has_refined = explained.refined is not None
     given = {
         "{more}": not report.left_out and all(one.pairs >= PAIRS for one in report.smoothed),
         "sigma": not report.gradient or bool(report.setup.levels),
@@ -135,7 +139,7 @@ def advice(report: Findings) -> str:
     settings = [
         s.format(more=_more(report), cause=cause) for s in dict.fromkeys(wanted) if not given.get(s.partition("=")[0])
     ]
-    prose = RULES[cause].advice.format(names=", ".join(report.suspects[:3]) or "the cost")
+    prose = RULES[cause].advice.format(names=", ".join(report.suspects[:3]) or "theta")
     if not report.command:
         return ", or ".join(filter(None, [prose, *settings]))
     return "\n  ".join([prose or "run" * bool(settings), *(again(report, setting) for setting in settings)])
@@ -170,7 +174,7 @@ def again(report: Findings, setting: str) -> str:
 def write(report: Findings) -> str:
     """Return the whole report: the answers, what was checked, what to do next, and the tables."""
     noise = noise_problems(report)[1 if report.gradient else 0 :]
-    error, step = report.error or report.elsewhere, advice(report)
+    error, step = report.error, advice(report)
     unit = "on theta" if report.setup.levels else "of each input's scale"
     derivatives = [
         row

@@ -146,15 +146,15 @@ class Watch:
         if self._simulator is None:
             self._simulator = Simulator(lambda x: self.cost(x, *self._given), layout, compiles=False)
         simulator, at, scale = self._simulator, layout.vector, layout.scales()
-        before, costs = simulator.clock.costs, simulator.costs
+        before, costs = simulator.clock.counts["costs"], simulator.costs
         draw = np.random.default_rng([self.seed, self.iteration])
         vectors = [scale * (one / np.linalg.norm(one)) for one in draw.standard_normal((DIRECTIONS, at.size))]
         space = Subspace(layout, scale, [], [Group(f"direction {i}", 0, at.size, v) for i, v in enumerate(vectors)])
         value, again = (float(costs(at[:, None])[0]) for _ in range(2))
         noise = abs(again - value)
         few = FewSteps(space, costs, slopes, value, simulator.unit, noise)
-        for _ in ROUNDS:
-            few.run_round(simulator.width)
+        for size in ROUNDS:
+            few.run_round(size, simulator.width)
         checked = few.check()
         row |= {
             "cost": value, "verdict": checked.cause, "error": max(part.error for part in checked.parts), "noise": noise,
@@ -163,7 +163,7 @@ class Watch:
             has_moved = self._before.size == at.size and (self._before != at).any()
             step = at - self._before if has_moved else FIRST_STEP * scale
             row |= _pairs(costs, at, slopes, step, draw) | _along(costs, at, slopes, step, value, noise, simulator.unit)
-        row["costs"] = simulator.clock.costs - before
+        row["costs"] = simulator.clock.counts["costs"] - before
 
     @property
     def first(self) -> tuple[int, str] | None:

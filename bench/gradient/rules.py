@@ -51,8 +51,8 @@ DERIVATIVE = {
         "fault", "the cost is constant between steps of its input: a cast to int, a rounding, a comparison",
         "of {roughness.SCAN} costs in a row, {roughness.EDGES} or more isolated changes exceed all others {roughness.APART:g} times, and "
         "the gradient is not the slope over them. Around theta: lines are flat between jumps, or the gradient misses "
-        "{findings.SEEN:.0%} of the cost's change in jumps of one height at even distances; or all differences are 0, and the gradient "
-        "is below {findings.RESIDUE:g} of a jump",
+        "{findings.SEEN:.0%} of the cost's change in jumps of one height at even distances; or the differences at the "
+        "{direction.MIN_STEPS} smallest steps are 0 beside jumps, and wider ones are not, or the gradient is below {findings.RESIDUE:g} of a jump",
         f"{SMOOTHING}, or remove the rounding",
     ),
     "precision": Rule(
@@ -179,7 +179,7 @@ EXAMINATION = {
     ),
     "unresolved": Rule(
         "open", "rounding or noise of the cost hides its slope at every step, or contradicts a small derivative",
-        "right, but the error of the difference is above {findings.DIGIT:.0%} of it, or both are {findings.CONTRADICTED:g} errors and "
+        "right, but the error of the difference is above {findings.DIGIT:.0%} of it, of derivatives that matter and of inputs below {findings.TINY:g}, or both are {findings.CONTRADICTED:g} errors and "
         "{findings.DIGIT:.0%} apart; or not 0 and below {findings.PART:.0%} of a difference that is below about {findings.SLIGHT:g} of the largest right derivative",
     ),
     "adaptive": Rule(

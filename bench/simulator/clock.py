@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -15,6 +16,8 @@ from bench.errors import UserError
 
 UNITS = {"ms": 1e-3, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, "": 1.0}
 """Seconds per unit of a budget."""
+KINDS = ("costs", "gradients")
+"""What is counted and timed."""
 MIN_ALARM_S, ALARM_INTERVAL_S = 1e-3, 1.0
 """Minimum delay of the alarm, and the interval at which the alarm repeats, in seconds."""
 PROGRESS_INTERVAL_S = 0.2
@@ -54,13 +57,12 @@ class Clock:
     ) -> None:
         self.start = time.perf_counter()
         self.budget, self.calls, self.compile_budget = budget, calls, compile_budget
-        self.costs = self.gradients = 0
-        """Number of evaluated costs and gradients, one per sample."""
-        self.cost_s = self.gradient_s = 0.0
-        """Seconds spent in cost and gradient calls, except the first call of each shape."""
+        self.counts: Counter[str] = Counter()
+        """Number of evaluated ``costs`` and ``gradients``, one per sample."""
         self.compile_s = 0.0
         """Seconds spent in the first call of each kind and shape."""
-        self._timed = {"costs": 0, "gradients": 0}
+        self._timed: Counter[str] = Counter()
+        self._seconds = dict.fromkeys(KINDS, 0.0)
         self._shown = shown and sys.stderr.isatty()
         self._stage, self._last_shown = "", 0.0
         self._deadline, self._last_call = math.inf, math.inf
@@ -80,7 +82,7 @@ class Clock:
     @property
     def used(self) -> int:
         """Number of costs and gradients computed so far."""
-        return self.costs + self.gradients
+        return self.counts.total()
 
     @property
     def remaining(self) -> float:
@@ -98,14 +100,14 @@ class Clock:
             return False
         if math.isinf(self.budget):
             return True
-        each, slope = self.per_cost(), self.per_gradient()
+        each, slope = map(self.seconds_per, KINDS)
         each = 0.0 if math.isnan(each) else each
         slope = 4.0 * each if math.isnan(slope) else slope
         return costs * each + gradients * slope <= share * self.remaining
 
     def affordable(self, share: float = 1.0) -> float:
         """Return the number of costs that fit a share (0 to 1) of the remaining budget."""
-        each = self.per_cost()
+        each = self.seconds_per("costs")
         timed = share * self.remaining / each if each > 0 and math.isfinite(self.budget) else math.inf
         return max(0.0, min(timed, share * self.remaining_calls))
 
@@ -157,22 +159,14 @@ class Clock:
 
     def count(self, kind: str, calls: int, taken: float, warm: bool) -> None:
         """Add ``calls`` samples of ``kind`` (costs or gradients), and their seconds if ``warm`` (nothing was compiled)."""
-        if kind == "costs":
-            self.costs += calls
-            self.cost_s += taken if warm else 0.0
-        else:
-            self.gradients += calls
-            self.gradient_s += taken if warm else 0.0
-        self._timed[kind] += calls if warm else 0
+        self.counts[kind] += calls
+        self._timed[kind] += calls * warm
+        self._seconds[kind] += taken * warm
         self._show_progress()
 
-    def per_cost(self) -> float:
-        """Return the mean seconds per cost, NaN before the first timed call."""
-        return self.cost_s / self._timed["costs"] if self._timed["costs"] else math.nan
-
-    def per_gradient(self) -> float:
-        """Return the mean seconds per gradient, NaN before the first timed call."""
-        return self.gradient_s / self._timed["gradients"] if self._timed["gradients"] else math.nan
+    def seconds_per(self, kind: str) -> float:
+        """Return the mean seconds per cost or gradient, without the first call of each shape; NaN before the first timed call."""
+        return self._seconds[kind] / self._timed[kind] if self._timed[kind] else math.nan
 
     @contextmanager
     def stage(self, name: str, left_out: list[str], share: float = 1.0) -> Iterator[None]:
@@ -192,7 +186,7 @@ class Clock:
             self._last_shown = self.elapsed
             limit = f" of {self.calls:,.0f} calls" * math.isfinite(self.calls)
             limit += f", {self.spent:.0f} s" + f" of {self.budget:.0f} s" * math.isfinite(self.budget)
-            text = f"{self._stage}: {self.costs} costs, {self.gradients} gradients{limit}"
+            text = f"{self._stage}: {self.counts['costs']} costs, {self.counts['gradients']} gradients{limit}"
             print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
 
     def clear_progress(self) -> None:

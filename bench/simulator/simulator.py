@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from functools import partial
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bench.errors import UserError, failure, unknown
-from bench.simulator.clock import Clock, OutOfTime
+from bench.simulator.clock import KINDS, Clock, OutOfTime
 from bench.simulator.tree import ParameterTree, as_numpy, numbers
 
 BATCHES = ("loop", "vmap", "columns", "rows")
@@ -72,14 +72,10 @@ class Simulator:
         self._compiles = compiles
         self.notes: list[str] = []
         """Notes for the user on how the cost is called."""
-        self.raised: dict[str, int] = {}
-        """Number of failed calls of the cost, after the first call, by exception."""
-        self.failed: deque[tuple[np.ndarray, ...]] = deque(maxlen=KEPT)
-        """The thetas of the last of these calls, and the noise w where there is some."""
-        self.gradient_error = ""
-        """The first exception of the gradient, or an empty string."""
-        self.n_failed_gradients = 0
-        """Number of gradient calls that raised an exception."""
+        self.raised: dict[str, Counter[str]] = {kind: Counter() for kind in KINDS}
+        """Number of failed calls of cost and gradient, after the cost's first call, by exception."""
+        self.failed: deque[tuple[Any, ...]] = deque(maxlen=KEPT)
+        """The last failed calls: ``costs`` or ``gradients``, their thetas, and the noise w where there is some."""
         self.precision = "float64"
         """Floating-point type of the cost: its own, or float32 where all its values have single precision."""
         self.printed = io.StringIO()
@@ -144,7 +140,7 @@ class Simulator:
         with self.clock.interrupt_when_over():
             sys.settrace(enter)
             try:
-                self._costs(*parts)
+                self._computed("costs", *parts)
             finally:
                 sys.settrace(before)
         self.clock.count("costs", 1, 0.0, warm=False)
@@ -189,7 +185,6 @@ class Simulator:
         return self._in_chunks("gradients", thetas, w)
 
     def _in_chunks(self, kind: str, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
-        function = self._costs if kind == "costs" else self._gradients
         count = thetas.shape[1]
         out = np.full(count if kind == "costs" else thetas.shape, np.nan)
         # one gradient needs no batch, which would compute and compile more
@@ -207,7 +202,7 @@ class Simulator:
             self._shapes.add(shape)
             began = self.clock.spent
             with self.clock.interrupt_when_over(first=is_first):
-                results = function(*(part[:, columns] for part in (thetas, w) if part is not None))
+                results = self._computed(kind, *(part[:, columns] for part in (thetas, w) if part is not None))
             taken = max(self.clock.spent - began, 0.0)
             self.clock.count(kind, n, taken, warm=not is_first)
             out[..., start : start + n] = results[..., :n]
@@ -221,35 +216,26 @@ class Simulator:
 
     # below, ``parts`` are the columns of theta and, if the cost has noise of its own, those of the noise
 
-    def _costs(self, *parts: np.ndarray) -> np.ndarray:
+    def _computed(self, kind: str, *parts: np.ndarray) -> np.ndarray:
+        """Return costs ``(B,)`` or gradients ``(d, B)``; NaN where the user's code raised an exception."""
+        is_cost = kind == "costs"
         try:
-            return np.asarray(self._values(*parts), dtype=np.float64)
+            values = self._values(*parts) if is_cost else self._slopes(*parts)
         except Exception as error:
-            if self.clock.is_interrupted:
-                raise OutOfTime from None
-            self.failed.append(tuple(part.copy() for part in parts))  # whose memory is used again
-            text = f"{type(error).__name__}: {error}"
-            self.raised[text] = self.raised.get(text, 0) + 1
-            return np.full(parts[0].shape[1], np.nan)
-
-    def _gradients(self, *parts: np.ndarray) -> np.ndarray:
-        try:
-            gradients = self._slopes(*parts)
-        except UserError:
-            raise
-        except Exception as error:
+            if isinstance(error, UserError) and not is_cost:
+                raise
             if self.clock.is_interrupted:
                 raise OutOfTime from None
             reason = failure(error)["reason"]
-            if isinstance(self._grad, str) and not self.clock.gradients:
+            if isinstance(self._grad, str) and not (is_cost or self.clock.counts[kind]):
                 advice = f"write it with {self._grad} alone, or give grad=FUNCTION"
                 raise UserError(f"{self._grad} cannot differentiate the cost: {advice} ({reason})") from None
-            self.gradient_error = self.gradient_error or reason
-            self.n_failed_gradients += 1
-            return np.full(parts[0].shape, np.nan)
-        if np.iscomplexobj(gradients):
+            self.failed.append((kind, *(part.copy() for part in parts)))  # whose memory is used again
+            self.raised[kind][reason] += 1
+            return np.full(parts[0].shape[is_cost:], np.nan)
+        if np.iscomplexobj(values) and not is_cost:
             raise UserError("the gradient is complex: the gradient of a real cost of real numbers is real")
-        return np.asarray(gradients, dtype=np.float64)
+        return np.asarray(values, dtype=np.float64)
 
     # ------------------------------------------------------------------------------------------ calling convention
 

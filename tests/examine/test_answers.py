@@ -70,8 +70,16 @@ def test_a_cost_without_a_gradient_gets_what_smoothing_gives_under_noise():
 def test_no_bound_on_the_bias_is_tighter_than_its_draws_support(pairs):
     """A linear cost: an event that none of 2 n draws meets is as likely as 3 in them, and moves the cost by 8 sigma."""
     report = examine(lambda x: float(x[0]), [1.0], grad=lambda x: [1.0], sigma=0.1, calls=4 * pairs + 2000)
-    bound = float(re.search(r"below ([\d.]+)%", report.noise_answer)[1])
+    bound = float(re.search(r"may add ([\d.]+)%", report.noise_answer)[1])
     assert bound > 100.0 * 3.0 / (2.0 * report.smoothed[0].pairs), str(report)
+
+
+def test_a_usable_gradient_has_a_bias_below_that_of_a_usable_one():
+    """Near a minimum, an event that no draw meets could move the cost by more than grad J does."""
+    report = examine(lambda x: float(x[0] ** 3), [0.1], grad=lambda x: [3 * x[0] ** 2], sigma=0.1, calls=20_000)
+    assert report.use == "usable"
+    below, more = map(float, re.search(r"below ([\d.]+)%, .* may add (\d+)%", report.noise_answer).groups())
+    assert below < 10.0 < more
 
 
 def test_the_advice_names_what_a_user_can_follow():

@@ -148,17 +148,23 @@ def test_an_interruption_that_a_compiled_library_turns_into_its_own_error_is_the
     assert report.left_out
 
 
-def test_exceptions_at_random_calls_are_named_as_such():
+@pytest.mark.parametrize("which", ["cost", "gradient"])
+def test_exceptions_at_random_calls_are_named_as_such(which):
     random = np.random.default_rng(3)
 
-    def fragile(x):
-        if random.random() < 0.1 and fragile.count:
-            raise ValueError("no convergence")
-        fragile.count += 1
-        return cost(x)
+    def fragile(function, share):
+        def call(x):
+            if random.random() < share and call.count:
+                raise ValueError("no convergence")
+            call.count += 1
+            return function(x)
 
-    fragile.count = 0
-    report = examine(fragile, THETA, grad=grad, calls=2000)
+        call.count = 0
+        return call
+
+    # few gradients are computed at theta, and many on lines
+    given = (fragile(cost, 0.1), grad) if which == "cost" else (cost, fragile(grad, 0.02))
+    report = examine(given[0], THETA, grad=given[1], calls=2000)
     assert (report.status, report.cause) == (1, "nondeterministic"), str(report)
     assert "equal calls raise an exception or return a number" in report.conclusion
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import bench
 from bench.gradient.smooth_part import smooth_part
 
 UNIT = float(np.finfo(np.float64).eps)
@@ -25,3 +26,16 @@ def test_the_smooth_part_of_a_rough_cost_is_known_within_its_error():
         found = smooth_part(rough, 1.0, UNIT, np.random.default_rng(seed))
         assert abs(found.slope - 2.0 * np.cos(0.3)) <= found.error, seed
         assert found.error < 1e-3
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.3, -1.0])
+def test_an_error_of_one_number_of_many_shows_through_a_rough_cost(factor):
+    """Numbers that are not checked one by one move along a random direction, which tiny steps do not show either."""
+    random = np.random.default_rng(0)
+    theta, along = random.uniform(0.5, 1.5, (2, 30))
+    factors = np.where(np.argsort(np.argsort(theta)) == 15, factor, 1.0)
+    report = bench.examine(
+        lambda x: float(x @ x + 1e-6 * np.sin(1e9 * (along @ x) * (1.0 + along @ x))), theta,
+        grad=lambda x: 2.0 * factors * x, calls=20_000, progress=False,
+    )  # fmt: skip
+    assert report.derivative in (("wrong",) if factor != 1.0 else ("right", "not shown")), str(report)

@@ -100,6 +100,14 @@ def steps_of(x):
     return float(np.sin(x[0]) * x[1] + 2e-4 * np.floor(1000 * x[0] + 0.5))
 
 
+def starting(x):
+    return float(np.sin(x[0]) + x[1] ** 2)
+
+
+def rounded(x):
+    return np.round(20.0 * x) / 20.0
+
+
 def latent(x, w):
     """For each draw the cost is flat, and the mean over draws is not."""
     return float(np.mean(np.round(x[0] + w)) ** 2)
@@ -175,6 +183,7 @@ CASES = {
         1, "", lambda x: np.float32(x[1]) * np.float32(x[0]) ** 2, lambda x: [2.006 * x[0] * x[1], x[0] ** 2], {}),
     "a seed taken from theta": (1, "rough", hashed, slope, {}),
     "chaos": (3, "unsettled", *chaos(60), {"theta": [0.1, 0.1], "calls": 1500}),
+    "chaos in few calls": (3, "unsettled", *chaos(60), {"theta": [0.1, 0.1], "calls": 20}),
     "an overflow": (1, "nan_gradient", *chaos(3000), {"theta": [0.1, 0.1], "calls": 1500}),
     "below the rounding of a cost that stays": (3, "constant", lambda x: 0.04, lambda x: [-2.5e-16, -4.7e-18], QUICK),
     "above the rounding of a cost that stays": (1, "", lambda x: 0.04, lambda x: [-2.5e-6, 0.0], QUICK),
@@ -191,6 +200,14 @@ CASES = {
     "a small slope beside an undefined one": (
         1, "", lambda x: float(x[0] > 0.9) + 3e-9 * np.sin(x[1]), lambda x: [0.0, 1e-9 * np.cos(x[1])], {"theta": [0.9, 0.3]}),
     "a hundred times as much": (1, "", residue(1e-4), by_size(8e-6), {}),
+    "a factor of an input that is nearly 0": (
+        3, "unresolved", starting, lambda x: [1.5 * np.cos(x[0]), 2 * x[1]], {"theta": [1e-12, 1.0]}),
+    "the same with its scale": (1, "", starting, lambda x: [1.5 * np.cos(x[0]), 2 * x[1]], {"theta": [1e-12, 1.0], "scale": 1.0}),
+    "tiny inputs that matter": (0, "smooth", lambda x: starting(1e9 * x), lambda x: [1e9 * np.cos(1e9 * x[0]), 2e18 * x[1]],
+                                {"theta": [1e-10, 1e-9]}),
+    "a gradient that mixes its batch": (
+        1, "nondeterministic", lambda x: np.sin(x[0]) * x[1],
+        lambda x: np.stack([np.cos(x[0]) * x[1], np.sin(x[0]).mean() + 0.0 * x[0]]), {"theta": [0.4, 0.9], "batch": "columns"}),
     "0 beside a small slope": (1, "disconnected", residue(1e-6), by_size(0.0), {}),
     "few calls beside a kink": (3, "unsettled", lambda x: float(5.0 * max(x[0] - 0.3 - 1e-9, 0.0) + np.sin(x[1])),
                                 lambda x: [5.0, np.cos(x[1])], {"theta": [0.3, 0.2], "calls": 30}),
@@ -203,6 +220,9 @@ CASES = {
     "constant between jumps": (1, "staircase", lambda x: np.floor(20 * x[0]) / 20, None, {"theta": [1.01], "sigma": 0.1}),
     "a straight-through rounding": (1, "staircase", lambda x: float(np.round(8.0 * x[0]) / 8.0), lambda x: [1.0],
                                     {"theta": [0.3], "sigma": [0.01, 0.5], "calls": 8000}),
+    "a straight-through rounding beside a smooth input": (
+        1, "staircase", lambda x: float(rounded(x[0]) ** 2 + x[1] ** 2 * rounded(x[0])),
+        lambda x: [2 * rounded(x[0]) + x[1] ** 2, 2 * x[1] * rounded(x[0])], {"theta": [0.62, 0.8]}),
     "jumps off the grid of steps": (1, "", lambda x: x[0] + np.floor(1e4 * x[0]) / 1e4, lambda x: [1.0], {"theta": [1.00005]}),
     "a rounded latent": (1, "staircase", latent, lambda x, w: [0.0], {"theta": [0.3], "sigma": 0.3, "noise": 20, "calls": 8000}),
     "no draw moves the cost": (3, "constant", lambda x: 1.0 * (x[0] > 30), lambda x: [0.0], {"theta": [0.0], "sigma": 0.1}),
