@@ -46,7 +46,7 @@ def test_a_continuous_cost_has_no_jump(name):
     assert search(SEEN[name])[0].height == 0.0
 
 
-FAR = "(1.9, 2.5, 5.0)"
+FAR = "[1.9, 2.5, 5.0]"
 """A gate 4.2 standard deviations away."""
 
 

@@ -14,7 +14,7 @@ def test_a_wrong_derivative_is_seen():
     class Wrong:
         def __init__(self, problem):
             self.program, self.value = problem.program, problem.value
-            self.grad = lambda theta, w: -problem.grad(theta, w)
+            self.grad = lambda *at: -problem.grad(*at)
 
     problem = Jax().compile(compose(BouncingBall(horizon=50), Impulse(), SemiImplicitEuler()))
     _, gradient, difference, _ = difference_check(Wrong(problem))
