@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 from bench.plugins.studies import stability
 from bench.plugins.studies.stability import Stability
+from classes import SemiImplicitEuler
 from helpers import loaded, unmeasured
 
 from bench.errors import Unsupported
@@ -98,8 +99,22 @@ def test_growth_of_ten_percent_is_divergence():
     assert "10%" in reason
     assert stability.first_bad_step(states, np.ones(1), 1.0, LIMITS) is None
     assert stability.first_bad_step(states, np.ones(1), math.nan, LIMITS) is None
-    far = np.array([[0.5], [1.0], [1.01]])
-    assert stability.first_bad_step(far, np.ones(1), 1.0, LIMITS)[:2] == (2, "diverged")
+    for far in (1.01, -1.01):
+        found = stability.first_bad_step(np.array([[0.5], [-1.0], [far]]), np.ones(1), 1.0, LIMITS)
+        assert found[:2] == (2, "diverged")
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1.0, 1e12])
+def test_growth_does_not_depend_on_the_unit_of_a_speed(unit):
+    """A spiral: a position of 1.02^k cos(k) and a speed of 1.02^k sin(k) grow by 2% a step."""
+    at = np.arange(20.0)
+    states = 1.02 ** at[:, None] * np.stack([np.cos(at), unit * np.sin(at)], axis=1)
+    assert stability.growth_factor(states) == pytest.approx(1.02, rel=1e-9)
+
+
+def test_the_stiffness_limit_is_found_to_the_last_digits():
+    """A semi-implicit Euler step without damping is stable up to dt^2 k = 4."""
+    assert stability.stiffness_limit(SemiImplicitEuler(), 0.1, 0.0, 1.0) == pytest.approx(400.0, rel=1e-6)
 
 
 @pytest.mark.parametrize("backend", ["jax", "torch", "numpy"])
@@ -142,6 +157,24 @@ def test_truth_is_refined_where_there_is_no_physical_gradient():
     truth = math.hypot(1.0, 10 * (1 - math.exp(-0.1)))
     assert row["truth_norm"] == pytest.approx(truth, rel=1 / LIMITS.fine_steps)
     assert row["truth_error"] < 1 / LIMITS.fine_steps
+
+
+@pytest.mark.parametrize(("inaccurate", "verdict"), [(0.06, "ok"), (0.03, "unresolved")])
+def test_a_truth_that_still_moves_by_half_the_limit_of_an_error_is_not_resolved(inaccurate, verdict):
+    """One step multiplies the speed by 0.9, and two by 0.95 each: positions of 0.9, and 0.5 (0.95 + 0.9025) = 0.92625."""
+    given, (cell,) = cells_of("scenes=[mass_spring]", "integrators=[semi_implicit_euler]", "backends=[jax]")
+    limits = Stability(fine_steps=2, finer=1, inaccurate=inaccurate)
+    row = limits.measure(cell.with_part("scene", Drop(horizon=1, dt=1.0)), RunSession(given))
+    assert row["truth_error"] == pytest.approx(0.02625 / math.hypot(1.0, 0.92625))
+    assert row["verdict"] == verdict
+
+
+def test_finer_steps_lose_as_much_speed_in_a_second():
+    _, (cell,) = cells_of(
+        "scenes=[mass_spring]", "scene.mass_spring.horizon=2", "scene.mass_spring.velocity_factor=0.81"
+    )
+    fine = stability._refined(cell, 4).scene
+    assert (fine.dt, fine.velocity_factor) == (cell.scene.dt / 2, pytest.approx(0.9))
 
 
 def test_scenes_without_time_steps_are_unsupported():
@@ -214,5 +247,5 @@ def test_rigid_impacts_are_not_blamed_on_the_law():
     words = ["scene.bouncing_ball.horizon=50", "scene.bouncing_ball.dt=0.02", "backends=[jax]"]
     words += ["scenes=[bouncing_ball]", "contacts=[impulse]", "integrators=[semi_implicit_euler]"]
     (row,) = measured(*words).to_dict("records")
-    assert (row["verdict"], row["cause"]) == ("wrong_sign", "step")
+    assert (row["verdict"], row["cause"], row["truth"]) == ("wrong_sign", "step", "physical")
     assert row["law_error"] < 0.05
