@@ -11,6 +11,7 @@ from bench.plugins.studies.bias_variance.comparisons import (
     WORKS,
     at_equal_rollouts,
     compare_errors,
+    lowest,
     method_table,
     ratio,
     verdict,
@@ -54,7 +55,7 @@ def made(*cells, **given):
     [
         ("ok", 0.5, 0.4, 0.6, WORKS), ("ok", 1.3, 0.65, 2.4, OPEN), ("ok", 0.71, 0.42, 4.0, OPEN), ("ok", 2.0, 1.5, 3.0, FAILS),
         ("ok", math.nan, math.nan, math.nan, OPEN), ("ok", 0.5, math.nan, math.nan, OPEN), ("ok", 2.0, 1.5, math.inf, FAILS),
-        ("ok", 0.5, 0.1, math.inf, OPEN), ("nonfinite", math.nan, math.nan, math.nan, NO_RESULT),
+        ("ok", 0.5, 0.1, math.inf, OPEN), ("ok", 0.5, math.nan, 0.6, OPEN), ("ok", 2.0, 1.5, math.nan, OPEN), ("nonfinite", math.nan, math.nan, math.nan, NO_RESULT),
     ],
 )  # fmt: skip
 def test_a_verdict_needs_the_whole_interval(status, error, low, high, expected):
@@ -71,6 +72,22 @@ def test_the_interval_of_a_factor_covers():
         _, low, high = ratio(*ends)
         hits += low <= 3.0 <= high
     assert 0.94 <= hits / 2000 <= 0.96
+
+
+@pytest.mark.parametrize(("first", "second"), [((2, 1, 12), (6, 6, 6)), ((2, 2, 2), (6, 1, 12))])
+def test_the_ends_of_a_factor_are_as_far_as_those_of_the_uneven_interval(first, second):
+    """A first value of up to 6 times itself, or a second of down to a sixth, makes the factor of 3 as many times less."""
+    assert np.array(ratio(first, second)) == pytest.approx([3.0, 0.5, 6.0])
+
+
+@pytest.mark.parametrize(("high", "found"), [(0.19, {"fobg"}), (0.21, set())])
+def test_the_lowest_interval_is_apart_from_those_of_other_estimators(high, found):
+    methods, _ = made(
+        cell(0.1, 0.09, high, stiffness=1e2, estimator="fobg"), cell(0.3, 0.2, 0.4, stiffness=1e2, estimator="b")
+    )
+    assert {name for _, name in lowest(methods)} == found
+    # a cost and a gradient of each sample
+    assert methods["evaluations"].tolist() == [2.0, 1.0]
 
 
 def test_methods_are_tied_unless_the_interval_of_their_factor_is_above_1():

@@ -5,20 +5,13 @@ import math
 import numpy as np
 import pytest
 from bench.plugins.studies.growth import classify, fit, products, rate
-from classes import DoubleIntegrator, Jax, SemiImplicitEuler
+from helpers import loaded
 
-from bench.model import compose
+from bench.run.session import RunSession
 
 
 def constant(matrix, horizon, batch=3):
     return np.broadcast_to(np.asarray(matrix)[None, :, :, None], (horizon, *np.shape(matrix), batch))
-
-
-def test_spectral_radius_of_the_double_integrator():
-    scene = DoubleIntegrator(horizon=30)
-    problem = Jax().compile(compose(scene, None, SemiImplicitEuler()))
-    _, spectral = products(problem.jacobians(scene.theta0(), np.zeros((30, 2))).a)
-    assert spectral == pytest.approx(0.0, abs=1e-6)  # sqrt(eps) of a defective eigenvalue
 
 
 def test_products_beyond_the_range_of_floats():
@@ -27,12 +20,40 @@ def test_products_beyond_the_range_of_floats():
     assert spectral == pytest.approx(1000 * math.log(10.0))
 
 
+def test_the_last_step_is_the_left_factor():
+    """diag(2, 1) [[1, 1], [0, 1]] = [[2, 2], [0, 1]], whose squares add up to 9; the other product is [[2, 1], [0, 1]]."""
+    singular, _ = products(np.array([[[1.0, 1.0], [0.0, 1.0]], [[2.0, 0.0], [0.0, 1.0]]])[..., None])
+    assert np.exp(2 * singular).sum() == pytest.approx(9.0)
+
+
+def test_what_is_measured_of_two_steps_of_a_free_mass_and_without_a_lost_gradient(monkeypatch):
+    """q_2 = c . u with c = (2, 1) and u = (1, 1), so J = 2 and its gradient is 2 c; a zeroth-order term is nearly 2 (c . w) w."""
+    words = "scenes=[double_integrator[horizon=2,dt=1,sigma=1e-3]]", "integrators=[semi_implicit_euler]"
+    given, (cell,) = loaded(
+        "study=growth", *words, "estimators=[fobg]", "backends=[implicit]", "samples=4000", "repeats=2"
+    )
+    session = RunSession(given)
+    problem = session.problem(cell)
+    right = problem.grad
+    lost = np.arange(8000) == 5
+    monkeypatch.setattr(problem, "grad", lambda theta, w: np.where(lost, math.nan, right(theta, w)))
+    row = given.study.measure(cell, session)
+    assert (row["status"], row["finite_fraction"]) == ("nonfinite", 7999 / 8000)
+    assert row["gradient_median"] == pytest.approx(2 * math.sqrt(5), rel=1e-3)
+    # 4 E (c . w)^2 |w|^2 - |2 c|^2 = 4 (4 - 1) 5, within nearly five standard errors
+    assert row["zeroth_order_variance_mean"] == pytest.approx(60.0, rel=0.2)
+    # of [[1, 2], [0, 1]]
+    assert row["stretch_rate"] == pytest.approx(math.log(1 + math.sqrt(2)) / 2)
+    assert row["spectral_rate"] == pytest.approx(0.0, abs=1e-6)  # sqrt(eps) of a defective eigenvalue
+
+
 @pytest.mark.parametrize(
     ("matrix", "expected"),
     [
         ([[1.1, 0.0], [0.3, 0.5]], "exploding"),
         ([[0.9, 0.1], [0.0, 0.5]], "vanishing"),
         ([[1.0, 0.1], [0.0, 1.0]], "neutral"),
+        ([[0.0, 1.0], [-1.0, 0.0]], "neutral"),
         ([[math.cos(0.3), 2 * math.sin(0.3)], [-math.sin(0.3) / 2, math.cos(0.3)]], "neutral"),
     ],
 )

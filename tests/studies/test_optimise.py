@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
+from bench.plugins.studies.optimise import measure as measured_by
 from bench.plugins.studies.optimise import views as studied
-from bench.plugins.studies.optimise.measure import scene_class
+from bench.plugins.studies.optimise.measure import scene_class, stored_indices
 from bench.plugins.studies.optimise.solve import solve
 from classes import ExplicitEuler, Impulse, Lqr, Penalty, SemiImplicitEuler, TwoBalls
 from helpers import loaded
@@ -167,6 +168,21 @@ def test_what_ends_a_search(tmp_path, words, stopped):
     row = measured(*words, "samples=4", folder=tmp_path)
     assert row["stopped"] == stopped
     assert row["status"] == ("diverged" if stopped == "diverged" else "ok")
+    # what is scored along the path is not paid for
+    assert (row["rollouts"], row["gradients"]) == (0, 4 * row["iterations"])
+
+
+def test_a_long_path_is_stored_with_its_start_its_lowest_cost_and_its_end():
+    found = stored_indices([*np.ones(990), 0.0, *np.ones(9)])
+    assert {0, 990, 999} <= set(found)
+    assert len(found) <= 301
+
+
+def test_a_bias_of_3_in_an_error_of_5_is_9_of_25_of_its_square(monkeypatch, tmp_path):
+    found = {"bias": 3.0, "rmse": 5.0, "reason": "", "reference_method": "", "reference_spacing": math.nan}
+    monkeypatch.setattr(measured_by, "against_reference", lambda *_: found)
+    row = measured("study=optimise[iterations=1]", "samples=3", folder=tmp_path)
+    assert row["quality_bias_share"] == pytest.approx(9 / 25)
 
 
 # ---------------------------------------------------------------------------------------------------- statistics
@@ -207,8 +223,13 @@ def searches(finals):
 
 
 def test_seeds_that_choose_a_tuning_do_not_score_it():
-    """A tuning that is lucky on the scored seeds is not taken, and one that is lucky on its own is scored without them."""
-    found = searches({("tuned", "1"): [1, 1, 9, 9, 9], ("tuned", "2"): [2, 2, 0, 0, 0], ("plain", ""): [5, 5, 5, 5, 5]})
+    """A tuning that is lucky on the scored seeds is not taken, and one that is lucky on its own is scored without them.
+
+    One that diverges is never taken, whatever its last cost.
+    """
+    tunings = {("tuned", "0"): [0] * 5, ("tuned", "1"): [1, 1, 9, 9, 9], ("tuned", "2"): [2, 2, 0, 0, 0]}
+    found = searches(tunings | {("plain", ""): [5, 5, 5, 5, 5]})
+    found.rows.loc[found.rows["tuning"] == "0", "status"] = "diverged"
     assert found.tuning_seeds == (0, 1)
     assert found.best_tunings == {("p", "tuned"): "1", ("p", "plain"): ""}
     assert found.best_runs.groupby("method")["final_cost"].mean().to_dict() == {"tuned": 9, "plain": 5}
@@ -227,7 +248,7 @@ def test_a_method_beats_the_baseline_in_the_share_of_pairs_that_it_wins():
     runs = searches({("fobg", ""): [3, 3, 3, 3, 3], ("other", ""): [1, 2, 3, 4, 5], ("failed", ""): [1, 1, 1, 1, 1]})
     runs.rows.loc[runs.rows["method"] == "failed", "status"] = "diverged"
     found = studied.improvement(runs)
-    assert found.loc["other"].tolist() == pytest.approx([0.5, *performance.wilson(2, 5)])
+    assert found.loc["other"].tolist() == pytest.approx([0.5, 0.1176208, 0.7692757], rel=1e-6)
     assert found["improvement"].isna().tolist() == [True, False, False]
     assert found.loc["failed", "improvement"] == 0.0
 
@@ -255,6 +276,7 @@ SAME, APART = ["a", "a", "a", "a", "a", "b"], ["a", "b", "c", "d", "e", "f"]
     [
         (APART, [0.6] * 6, False),
         (SAME, [0.6] * 6, False),
+        (APART, [0.1] * 6, True),
         (APART, [0.9] * 5 + [0.2], False),
         (SAME, [0.9] * 5 + [0.2], True),
     ],
@@ -272,6 +294,9 @@ def test_intervals_are_over_scenes():
         assert line["reached"] == pytest.approx(0.5)
         wide[name] = line["reached_high"] - line["reached_low"]
         assert line["score_low"] <= line["score"] <= line["score_high"]
+        if name == "few":
+            # of one scene twice, with 70% or 30% of ones: the middle half has 90% or 10%
+            assert [line["score_low"], line["score_high"]] == pytest.approx([0.1, 0.9])
     assert wide["few"] > wide["many"] > wide["one"]
     # deviations of 0.2 over six scenes, and Student's quantile with 5 degrees of freedom
     assert wide["many"] == pytest.approx(2 * 2.5706 * 0.2 / math.sqrt(5), rel=1e-4)

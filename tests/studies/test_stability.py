@@ -98,8 +98,16 @@ def test_growth_of_ten_percent_is_divergence():
     assert "10%" in reason
     assert stability.first_bad_step(states, np.ones(1), 1.0, LIMITS) is None
     assert stability.first_bad_step(states, np.ones(1), math.nan, LIMITS) is None
-    far = np.array([[0.5], [1.0], [1.01]])
+    far = np.array([[0.5], [1.0], [-1.01]])
     assert stability.first_bad_step(far, np.ones(1), 1.0, LIMITS)[:2] == (2, "diverged")
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1.0, 1e12])
+def test_growth_does_not_depend_on_the_unit_of_a_speed(unit):
+    """A spiral: a position of 1.02^k cos(k) and a speed of 1.02^k sin(k) grow by 2% a step."""
+    at = np.arange(20.0)
+    states = 1.02 ** at[:, None] * np.stack([np.cos(at), unit * np.sin(at)], axis=1)
+    assert stability.growth_factor(states) == pytest.approx(1.02, rel=1e-9)
 
 
 @pytest.mark.parametrize("backend", ["jax", "torch", "numpy"])
@@ -144,6 +152,24 @@ def test_truth_is_refined_where_there_is_no_physical_gradient():
     assert row["truth_error"] < 1 / LIMITS.fine_steps
 
 
+def test_a_truth_that_still_moves_by_half_the_limit_of_an_error_is_not_resolved():
+    """One step multiplies the speed by 0.9, and two by 0.95 each: positions of 0.9, and 0.5 (0.95 + 0.9025) = 0.92625."""
+    given, (cell,) = cells_of("scenes=[mass_spring]", "integrators=[semi_implicit_euler]", "backends=[jax]")
+    row = Stability(fine_steps=2, finer=1, inaccurate=0.03).measure(
+        cell.with_part("scene", Drop(horizon=1, dt=1.0)), RunSession(given)
+    )
+    assert row["truth_error"] == pytest.approx(0.02625 / math.hypot(1.0, 0.92625))
+    assert row["verdict"] == "unresolved"
+
+
+def test_finer_steps_lose_as_much_speed_in_a_second():
+    _, (cell,) = cells_of(
+        "scenes=[mass_spring]", "scene.mass_spring.horizon=2", "scene.mass_spring.velocity_factor=0.81"
+    )
+    fine = stability._refined(cell, 4).scene
+    assert (fine.dt, fine.velocity_factor) == (cell.scene.dt / 2, pytest.approx(0.9))
+
+
 def test_scenes_without_time_steps_are_unsupported():
     (row,) = measured("scenes=[quadratic]", "backends=[jax]").to_dict("records")
     assert row["status"] == "unsupported"
@@ -163,6 +189,9 @@ def test_contact_springs_are_oscillators_while_they_last():
         "scene.bouncing_ball.mass=2", "contact.penalty.damping=4", "contact.penalty.stiffness=100",
     )  # fmt: skip
     assert stability.oscillator(cell) == (50.0, 2.0, 1.0)
+    # a step is stable up to dt^2 k = 4 - 2 dt c, with k and c per unit of mass
+    dt = cell.scene.dt
+    assert stability.theory(cell)["stiffness_limit"] == pytest.approx(2.0 * (4.0 / dt - 2.0 * 2.0) / dt)
 
 
 def test_backends_that_disagree_show_the_worse_verdict_and_no_verdict_is_no_finding():
@@ -214,5 +243,5 @@ def test_rigid_impacts_are_not_blamed_on_the_law():
     words = ["scene.bouncing_ball.horizon=50", "scene.bouncing_ball.dt=0.02", "backends=[jax]"]
     words += ["scenes=[bouncing_ball]", "contacts=[impulse]", "integrators=[semi_implicit_euler]"]
     (row,) = measured(*words).to_dict("records")
-    assert (row["verdict"], row["cause"]) == ("wrong_sign", "step")
+    assert (row["verdict"], row["cause"], row["truth"]) == ("wrong_sign", "step", "physical")
     assert row["law_error"] < 0.05

@@ -7,6 +7,8 @@ import pytest
 from bench.plugins.studies.bias_variance.time_to_accuracy import (
     ROLLOUTS,
     TIME,
+    RequiredCost,
+    lead,
     limits,
     required_cost,
     with_gradient_cost,
@@ -123,6 +125,12 @@ def test_a_bias_decides_whether_an_error_of_10_percent_is_reached(given, how):
         assert found.beyond == pytest.approx(0.4)
 
 
+def test_samples_beyond_the_measured_ones_cost_more_than_these():
+    """Without the bias of 8%, which may be 0, the variance would reach 10% with 200 samples, and 256 did not."""
+    found = required_cost(line(bias=0.08, resolved=False).assign(variance=8 / 256, rmse_rel=0.12), 0.1, TIME)
+    assert (found.samples, found.cost) == (256, 0.256)
+
+
 @pytest.mark.parametrize("given", [{"estimator": "quadratic_model"}, {"draws": "sobol"}])
 def test_samples_that_are_coupled_are_not_extrapolated(given):
     """The error of such an estimator need not fall as the root of 1 / N: only measured counts tell."""
@@ -165,6 +173,22 @@ def test_a_cost_at_the_fewest_samples_is_a_limit():
     assert found["how"] == "at once"
     assert (math.isnan(found["factor"]), found["factor_high"]) == (True, math.inf)
     assert limits(pd.DataFrame([found])) == ["at least 25"]
+
+
+TWO, THREE = math.log(2), math.log(3)
+
+
+@pytest.mark.parametrize(("first", "second"), [((TWO, THREE), (0, 0)), ((0, 0), (THREE, TWO))])
+def test_a_lead_is_as_uncertain_as_each_cost_and_to_the_same_side(first, second):
+    """A first cost of up to 3 times itself, or a second of down to a third, makes the lead of 6 as many times less."""
+    costs = [RequiredCost("measured", cost, down=down, up=up) for cost, (down, up) in ((2.0, first), (12.0, second))]
+    assert lead(*costs) == pytest.approx((6.0, 2.0, 12.0))
+
+
+def test_an_error_that_no_method_is_known_to_reach_may_not_be_never_reached():
+    biased = rows(bias=0.3)
+    assert entry(biased)["how"] == "never"
+    assert entry(biased, rows(estimator="quadratic_model"))["how"] == "not known"
 
 
 @pytest.mark.parametrize(("width", "tied"), [(1.0, ()), (1.2, ()), (3.0, ("slow on b",))])

@@ -79,7 +79,6 @@ def method_table(shown: Arranged) -> pd.DataFrame:
     for axis, problem in problems_by_axis(shown):
         rows, title, along = estimator_curves(problem.rows), problem.title(), axis.column if axis else ""
         error, low, high, is_limit = shown_rmse(rows)
-        error = np.where(rows["status"] == "ok", error, math.nan)
         samples = rows["x"] if along == "samples" else rows["samples"]
         kinds = {name: str(problem.rows[name].iloc[0]).partition("[")[0] for name in CATEGORIES}
         parts.append(pd.DataFrame({
