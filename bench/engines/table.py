@@ -90,7 +90,7 @@ def write(names: Sequence[Engine], out: Path, settings: Sequence[str] = ()) -> P
         table = pd.concat([old[~is_new], table]).sort_values(["engine", "versions"], kind="stable")
     table.to_csv(stored, index=False)
     place = out / ", ".join(releases).replace(" ", "-").replace(",-", ",")
-    words = [f"+experiment={GRADIENTS}", f"backends=[{','.join(backends)}]", f"results_dir={place}", *settings]
+    words = [f"+experiment={GRADIENTS}", f"backends=[{','.join(backends)}]", f"results_dir='{place}'", *settings]
     if backends:
         subprocess.run([sys.executable, "-m", "bench", *words], check=False)
     page = out / "engines.md"

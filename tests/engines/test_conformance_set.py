@@ -19,6 +19,7 @@ import bench
 from bench.cli import main
 from bench.engines import conformance, table
 from bench.engines.conformance import runner
+from bench.experiment import config
 
 pytest.importorskip("mujoco")
 ROOT = Path(__file__).resolve().parents[2]
@@ -431,6 +432,15 @@ def test_the_table_keeps_other_releases(tmp_path, monkeypatch):
         "| case | term | mujoco 3.1 | mujoco 3.2 |\n| --- | --- | --- | --- |\n| rk4 | qvel | wrong | right |" in page
     )
     assert "- mujoco 3.1, rk4 qvel: -1 times" in page
+
+
+def test_two_releases_have_a_folder_that_settings_can_name(tmp_path, monkeypatch):
+    """Its name has a comma, which settings read in quotes only."""
+    commands = []
+    monkeypatch.setattr(table.subprocess, "run", lambda words, **options: commands.append(words))
+    monkeypatch.setattr(table.Engine, "rows", lambda self, *of: [{"versions": f"mujoco {self.release}", "case": "rk4"}])
+    table.write([table.Engine("mujoco"), table.Engine("mujoco==4.0.0")], tmp_path)
+    assert "mujoco-4.0.0" in str(config.load(commands[0][3:]).results_dir)
 
 
 @pytest.mark.slow
