@@ -55,9 +55,11 @@ class Engine:
 
         If it cannot run, the run fails or takes longer than :data:`LIMIT_S`, the last row has the reason.
         """
+        if self.missing:
+            return [{"reason": self.missing}]
         file = self.file("_conformance.py")
-        if self.missing or not file.exists():
-            return [{"reason": self.missing or f"no file {file.name}"}]
+        if not file.exists():
+            return [{"reason": f"no file {file.name}"}]
         path = {} if self.is_outside else {"PYTHONPATH": str(Path(runner.__file__).parents[3])}
         return run(self.python, script, str(file), *words, environment=os.environ | path)
 

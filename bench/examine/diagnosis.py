@@ -35,6 +35,8 @@ SPREADS = (0.0, 0.05, 0.1, 0.2, 0.4)
 """Distances from theta, in units of each input's scale, at which the loops of the program are compared."""
 ELSEWHERE, AROUND = 2, 0.05
 """Number of other thetas at which the gradient is compared with a refined cost, and their distance in units of the scales."""
+ALONG = 4
+"""Random directions of these comparisons at each theta, beside the components."""
 LONGER = 10.0
 """Length of the line on which more jumps are searched, in multiples of the first line."""
 DIFFERENCED, SAME = 4, 1e-3
@@ -95,14 +97,18 @@ class Explanation:
 
 
 def refined_slopes(stages: GradientStages, other: Simulator) -> np.ndarray:
-    """Return by theta the slopes by components that gradient, cost and refined cost have, ``(1 + ELSEWHERE, 3, m)``, theta first.
+    """Return by theta the slopes that gradient, cost and refined cost have, ``(1 + ELSEWHERE, 3, m)``, theta first.
 
-    A slope is the change over the scale of an input.
+    They are along the checked components, and then along random directions of all inputs. A slope is the change over the
+    scale of an input.
     """
     index = [part.component or 0 for part in stages.check.components]
-    vectors = np.zeros((stages.theta.size, len(index)))
-    vectors[index, np.arange(len(index))] = stages.scale[index]
     random, eps = np.random.default_rng([stages.seed, 0x676170]), float(np.cbrt(stages.simulator.unit))
+    vectors = np.zeros((stages.theta.size, len(index) + min(ALONG, stages.theta.size)))
+    vectors[index, np.arange(len(index))] = 1.0
+    around = random.standard_normal(vectors[:, len(index) :].shape)
+    vectors[:, len(index) :] = around / np.linalg.norm(around, axis=0)
+    vectors *= stages.scale[:, None]
     rows = []
     for spread in (0.0, *[AROUND] * ELSEWHERE):
         theta = stages.theta + spread * stages.scale * random.standard_normal(stages.theta.size)

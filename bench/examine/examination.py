@@ -32,7 +32,7 @@ from bench.examine.smoothing import (
 from bench.examine.stages import GradientStages
 from bench.gradient import Check
 from bench.gradient.rules import RULES, SUSPICIOUS
-from bench.simulator.clock import KINDS, Clock, OutOfTime, parse_duration
+from bench.simulator.clock import Clock, OutOfTime, parse_duration
 from bench.simulator.simulator import Simulator
 from bench.simulator.tree import ParameterTree
 
@@ -276,8 +276,8 @@ class _Examination:
             repeats=stages.repeats,
             setup=setup,
             spent=Spent(
-                *(clock.counts[kind] for kind in KINDS), clock.spent, clock.compile_s, clock.elapsed,
-                *(clock.seconds_per(kind) for kind in KINDS), clock.budget, clock.calls,
+                clock.counts["costs"], clock.counts["gradients"], clock.spent, clock.compile_s, clock.elapsed,
+                clock.seconds_per("costs"), clock.seconds_per("gradients"), clock.budget, clock.calls,
             ),
             check=checked,
             is_complete=stages.is_complete,

@@ -281,7 +281,7 @@ class Findings:
         if index is None and group is None:
             return replace(part, verdict="smooth_part") if is_open or part.verdict in rules.BROKEN else part
         wide, refined = explained.smooth_parts.get(part.name), self._refined.get(part.name)
-        is_known = wide is refined is None and (part.name in explained.smooth_parts or not is_open)
+        is_known = wide is None and refined is None and (part.name in explained.smooth_parts or not is_open)
         if is_known or not doubtful([part], self.groups):
             return part
         slope, error = (part.difference, math.inf) if wide is None else (wide.slope, wide.error)
@@ -613,9 +613,12 @@ class Findings:
         refined, is_varied = self.explained.refined, bool(self.explained.steps)
         if refined is None:
             return is_varied and bool(self.explained.is_adaptive)
-        gradient, own = np.linalg.norm(refined[:, :2] - refined[:, 2:], axis=2).T
-        is_far = np.linalg.norm(gradient) > AS_FAR * np.linalg.norm(own)
-        return bool((gradient <= AGREES * own).all() or (is_varied and not is_far))
+        # along the checked components and along random directions: a wrong input may be none of the former
+        parts = np.split(refined, [len(self.check.components)], axis=2)
+        gaps = [np.linalg.norm(slopes[:, :2] - slopes[:, 2:], axis=2).T for slopes in parts]
+        agrees = all((gradient <= AGREES * own).all() for gradient, own in gaps)
+        is_near = all(np.linalg.norm(gradient) <= AS_FAR * np.linalg.norm(own) for gradient, own in gaps)
+        return agrees or (is_varied and is_near)
 
     @property
     def derivative(self) -> str:

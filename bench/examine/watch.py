@@ -8,7 +8,7 @@ import random
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +104,8 @@ class Watch:
         if self.iteration % self.every == 0:
             self._check(theta, gradient, w)
         if (self.iteration + 1) % self.every == 0:
-            self._before = numbers(theta).copy()
+            with suppress(Exception):  # such as a buffer that the loop has given away
+                self._before = numbers(theta).copy()
 
     def _check(self, theta: Any, gradient: Any, w: Any) -> None:
         """Add a row on the gradient at theta, and write it."""

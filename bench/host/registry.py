@@ -184,7 +184,7 @@ def _modules(package: ModuleType) -> Iterator[tuple[str, str]]:
         full = f"{package.__name__}.{name}"
         # a folder of plugins need not have an __init__.py
         is_folder = path.is_dir() and name.isidentifier() and not is_package and any(path.glob("*.py"))
-        if name in NOT_PLUGINS or name == "__init__":
+        if name in NOT_PLUGINS or name == "__init__" or "." in name:
             continue
         if is_folder or (is_package and name in KINDS):
             for module in pkgutil.iter_modules(importlib.import_module(full).__path__):

@@ -38,7 +38,7 @@ def shared(
         block = draw(*given)
         if block.size > HELD:
             return block
-        while sum(kept.size for kept in _kept.values()) > KEPT - block.size:
+        while len(_kept) >= 8 or sum(kept.size for kept in _kept.values()) > KEPT - block.size:
             del _kept[next(iter(_kept))]
     _kept[given] = block
     own = block.copy(order="K")

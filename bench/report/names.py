@@ -1,10 +1,11 @@
-"""Shortens the names of problems and methods in charts: each keeps its words, and the parameters that distinguish it."""
+"""Names of charts in words. A problem keeps the parameters that distinguish it, and a method all that are named."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable
 from dataclasses import replace
+from pathlib import PurePath
 
 import pandas as pd
 
@@ -16,10 +17,12 @@ from bench.report.text import axis_value
 PLUGIN = re.compile(r"(\w+)\[([^\[\]]*=[^\[\]]*)\](.*)")
 """A plugin's name, its parameters and the rest of a part of a name: ``fobg[mirrored=true] (numpy)``."""
 SETTING = re.compile(r"\w+=\S+")
+METHODS = ("method", "estimator")
+"""Columns of methods, whose settings are not a matter of the chart: without one the name is another method's."""
 
 
-def short_names(names: Iterable[str]) -> dict[str, str]:
-    """Return the short name of each name: its words, and of its parameters only those that distinguish it from the others.
+def short_names(names: Iterable[str], is_whole: bool = False) -> dict[str, str]:
+    """Return the short name of each name: its words, and of its parameters those that distinguish it from the others, or all.
 
     >>> def show(*names: str) -> None: print(*short_names(names).values(), sep="; ")
     >>> show("push, law, descent=0", "push, law, descent=0.9")
@@ -34,12 +37,15 @@ def short_names(names: Iterable[str]) -> dict[str, str]:
     gap [m]; |dx_k+1 / dx_k|; theta[0]; first order, step 5 ms; dt = 1/480 s
     >>> show("a_b", "a b")
     a_b; a b
+    >>> short_names(["smoothing[draws=orthogonal]"], is_whole=True)
+    {'smoothing[draws=orthogonal]': 'smoothing, draws orthogonal'}
     """
     parsed = {name: _parts(name) for name in dict.fromkeys(names)}
     table = pd.DataFrame([*parsed.values()]).fillna("")
     words = [column for column in table if column[1] == ""]
     common = [column for name in IDENTITY for column in table if column[1] == name]
-    kept = distinguishing_columns(table, table.index.to_series(), dict.fromkeys([*words, *common, *table]), words)
+    ordered = dict.fromkeys([*words, *common, *table])
+    kept = ordered if is_whole else distinguishing_columns(table, table.index.to_series(), ordered, words)
     order = sorted(kept, key=lambda column: column[0] or "last")
     short = [", ".join(filter(None, line)) for line in table[order].to_numpy()]
     return dict(zip(parsed, short if len(set(short)) == len(parsed) else parsed, strict=True))
@@ -55,7 +61,7 @@ def _parts(name: str) -> dict[tuple[str, str], str]:
         )
         for key, _, value in (one.partition("=") for one in inside.split(",") if inside):
             if key == "file":  # the model stands for the plugin that reads it
-                word = re.split(r"[/.]", value)[-2]
+                word = PurePath(value.rpartition(":")[2]).stem
             else:
                 found[str(place) * bool(word), key] = setting(key, value)
         if word:
@@ -76,8 +82,9 @@ def in_words(chart: Chart) -> Chart:
     """Return a chart whose panels, series and categories have short names; its looks, notes and marks follow."""
     columns = dict.fromkeys((chart.panel, chart.series, *(c.name for c in (*chart.x, *chart.y) if c.kind == "text")))
     texts = [name for name in columns if name and not pd.api.types.is_numeric_dtype(chart.frame[name])]
-    short = {name: short_names(chart.frame[name].astype(str)) for name in texts}
-    frame = chart.frame.assign(**{name: chart.frame[name].astype(str).map(names) for name, names in short.items()})
+    given = {name: chart.frame[name].fillna("").astype(str) for name in texts}
+    short = {name: short_names(names, name in METHODS) for name, names in given.items()}
+    frame = chart.frame.assign(**{name: given[name].map(names) for name, names in short.items()})
     series, panels = short.get(chart.series, {}), short.get(chart.panel, {})
     return replace(
         chart, frame=frame, styles={series.get(name, name): style for name, style in chart.styles.items()},

@@ -41,7 +41,9 @@ class References:
             lists = {
                 name: np.array(value, dtype=np.float64) for name, value in found.items() if isinstance(value, list)
             }
-            return Reference(**{**found, **lists})
+            reference = Reference(**{**found, **lists})
+            if reference.batches.ndim == 2 and reference.batches.size and 0.0 * reference.error == 0.0:
+                return reference
         return None
 
     def of(self, cell: Cell) -> Reference:

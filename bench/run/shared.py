@@ -1,12 +1,10 @@
-"""Stores what the cells of several experiments share, references and descents, beside the experiments."""
+"""Stores what the cells of several experiments share, references, descents and optima, beside the experiments."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
 from typing import Any
-
-import numpy as np
 
 from bench.experiment.experiment import Experiment
 from bench.host import reads
@@ -27,7 +25,7 @@ class Shared:
         """Return a stored result; None if the file is missing or unreadable, or something that it has read has changed."""
         found = read_object(self.folder / f"{name}.json")
         read = found.pop("reads", "")
-        if not found or self._present.change(read):
+        if not found or not isinstance(read, str) or self._present.change(read):
             return None
         reads.include(read)
         return found
@@ -36,4 +34,4 @@ class Shared:
         """Store a result with what has been ``read`` for it, by default all that code from outside has read here."""
         make_directory(self.folder)
         content = {**found, "reads": reads.manifest() if read is None else read}
-        write_whole(self.folder / f"{name}.json", json.dumps(content, default=np.ndarray.tolist).encode())
+        write_whole(self.folder / f"{name}.json", json.dumps(content, default=lambda value: value.tolist()).encode())

@@ -34,7 +34,7 @@ def parse_duration(budget: float | str, what: str = "budget") -> float:
     >>> parse_duration("2m"), parse_duration(0.5)
     (120.0, 0.5)
     """
-    text = str(budget).strip()
+    text = str(budget).strip().lower()
     number = text.rstrip("abcdefghijklmnopqrstuvwxyz ")
     value = math.nan
     with suppress(ValueError, KeyError):

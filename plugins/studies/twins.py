@@ -80,7 +80,10 @@ class Twins(StudyPackage):
         """
         if "physics" not in cell.backend.provides:
             raise Unsupported(f"backend {cell.backend.name} has no twin to compare: its steps are the scene's own")
-        other = (cell.ranked_backends or capable_backends(cell.program()))[0]
+        able = cell.ranked_backends or capable_backends(cell.program())
+        other = next((backend for backend in able if backend.name != cell.backend.name), None)
+        if other is None:
+            raise Unsupported(f"no backend but {cell.backend.name} runs this program")
         twin, own = session.problem(cell), session.problems.of(other, cell)
         theta, still = twin.program.theta0, np.zeros((twin.program.n_noise, 1))
         path, own_path = (problem.trajectory(theta, still).states[:, :, 0] for problem in (twin, own))

@@ -79,6 +79,8 @@ def charts(
         if not any(axis.column in other.moves for other in order[:i])  # axes that step together have one chart
     ]
     along = [_contrast(labelled, subtitle), *along]
+    if not swept and is_timed:
+        along += [_error_and_time(labelled, subtitle)]
     is_grid = (methods[["setting", "estimator"]].nunique() > 1).all()
     if max(swept.values(), default=0) < LEAST and is_grid:
         along = [_estimators(methods), *along]
@@ -185,7 +187,7 @@ def _lines(problem: ProblemRows, compared: str, names: Sequence[str]) -> pd.Data
 def _nested(names: Sequence[str]) -> dict[str, Style]:
     """Return looks of backends or contact laws in which lines on top of each other are all seen: each later one is thinner."""
     return {
-        name: Style(colour(i), MARKERS[i], width=1.2 * (len(names) - i), meaning=": ".join(filter(None, (short, _summary(name)))))
+        name: Style(colour(i), MARKERS[i % len(MARKERS)], width=1.2 * (len(names) - i), meaning=": ".join(filter(None, (short, _summary(name)))))
         for i, (name, short) in enumerate(short_names(names).items())
     }  # fmt: skip
 
@@ -240,7 +242,7 @@ def _contrast(shown: Arranged, subtitle: str) -> Chart | None:
         panel="panel", arrow="arrow", arrow_name=f"{along.column} {' to '.join(f'{end:,g}' for end in ends)} {along.unit}".rstrip(),
         across=2, height=2.2, own_scales=True, subtitle=", ".join(filter(None, [subtitle, FASTEST])),
         panel_notes={panel: _summary(law) for panel, law in zip(frame["panel"], frame["contact"], strict=True)},
-        styles={name: replace(look, meaning=f"{short_names(looks)[name]}: {_family(name.partition('[')[0])}") for name, look in looks.items()},
+        styles={name: replace(look, meaning=f"{short_names(looks, is_whole=True)[name]}: {_family(name.partition('[')[0])}") for name, look in looks.items()},
     )  # fmt: skip
 
 
@@ -257,11 +259,26 @@ def _on_fastest(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[times == times.min()]
 
 
-def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Chart:
+def _error_and_time(shown: Arranged, subtitle: str) -> Chart | None:
+    """Return error against time where nothing was swept: a point per estimator on its fastest backend, a panel per problem."""
+    rows = with_known(shown.rows.assign(panel=titled(shown.rows, ["scene", "contact"])), TIME)
+    if rows.empty:
+        return None
+    frame = pd.concat([_on_fastest(part) for _, part in rows.groupby(["series", "panel"], sort=False)])
+    return Chart(
+        "speed_accuracy", frame, [SECONDS], [RMSE], "points", series="series", panel="panel", across=3, height=1.9,
+        title="What error has one estimate, and what time does it take?",
+        subtitle=", ".join(filter(None, [subtitle, FASTEST])),
+    )  # fmt: skip
+
+
+def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Chart | None:
     """Return the time of each estimator to reach an error, as a table whose colours are its factor to the first of each problem.
 
     Where backends are compared, each has a panel; else an estimator is on its fastest.
     """
+    if best.empty:
+        return None
     target, backends = TARGETS[0], shown.experiment.compares.get("backends", ())
     lead = best[(best["by"] == "time") & (best["relative error"] == target)].set_index("problem")
     lines = [
@@ -270,6 +287,8 @@ def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Cha
         for problem in split_by_problem(shown, SAMPLES, ("scene",)) if problem.title() in lead.index
         for name, needed in methods_by_cost(problem, target, TIME).items()
     ]  # fmt: skip
+    if not any(np.isfinite(line["cost"]) for line in lines):
+        return None
     frame = pd.DataFrame(lines).sort_values("cost")
     frame = frame.drop_duplicates(["problem", "series", *["backend"] * bool(backends)]).sort_index()
     frame = frame[frame["backend"].isin(backends or frame["backend"]) & np.isfinite(frame["cost"])]
