@@ -17,7 +17,7 @@ from bench.report.text import axis_value
 PLUGIN = re.compile(r"(\w+)\[([^\[\]]*=[^\[\]]*)\](.*)")
 """A plugin's name, its parameters and the rest of a part of a name: ``fobg[mirrored=true] (numpy)``."""
 SETTING = re.compile(r"\w+=\S+")
-METHODS = ("method", "estimator")
+METHODS = ("method", "estimator", "series")
 """Columns of methods, whose settings are not a matter of the chart: without one the name is another method's."""
 
 

@@ -81,7 +81,7 @@ class Twins(StudyPackage):
         if "physics" not in cell.backend.provides:
             raise Unsupported(f"backend {cell.backend.name} has no twin to compare: its steps are the scene's own")
         able = cell.ranked_backends or capable_backends(cell.program())
-        other = next((backend for backend in able if backend.name != cell.backend.name), None)
+        other = next((backend for backend in able if backend != cell.backend), None)
         if other is None:
             raise Unsupported(f"no backend but {cell.backend.name} runs this program")
         twin, own = session.problem(cell), session.problems.of(other, cell)

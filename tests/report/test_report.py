@@ -226,7 +226,7 @@ def test_nothing_swept_gives_a_table_of_estimators_and_problems():
         [row(estimator=e, backend=b, scene=s) for e in NAMES for b in BACKENDS for s in ("pushing", "heaviside")]
     )
     found = drawn(rows, ["sigma"], sweep={"sigma": [0.1]})
-    assert set(found) == {"estimators"}
+    assert set(found) == {"estimators", "speed_accuracy"}
     assert set(found["estimators"].frame["series"]) == set(NAMES)
     assert found["estimators"].kind == "grid"
 

@@ -242,6 +242,7 @@ def curves_of(runs: pd.DataFrame) -> pd.DataFrame:
         curves = np.array([*zip_longest(*part["curve_return"], fillvalue=math.nan)], dtype=float).T
         costs = -np.where(np.isfinite(curves), curves, curves[:, :1])
         steps, times = max(part["curve_step"], key=len), pd.DataFrame([*part["curve_s"]]).median()
+        times = times.reindex(range(len(steps))).to_numpy()
         named = {"problem": problem, "method": method, "step": np.asarray(steps, dtype=float), "time": times}
         parts.append(pd.DataFrame(named | middle_with_interval("cost", costs)))
     return pd.concat(parts, ignore_index=True)
