@@ -249,3 +249,20 @@ def test_a_gradient_gets_its_verdict(name):
     report = bench.examine(cost, grad=grad, progress=False, **{"theta": START, "calls": 3000, **settings})
     assert report.status == status, str(report)
     assert cause in ("", report.cause), str(report)
+
+
+def test_a_refined_cost_excuses_no_block_that_no_component_shows():
+    """The 16 components that were compared are right, and 16 of 400 inputs are wrong by half."""
+    random = np.random.default_rng(0)
+    weights, theta = random.uniform(1.0, 2.0, 400), random.uniform(0.5, 1.5, 400)
+
+    def refined(x):
+        return float(weights @ x**2)
+
+    def gradient(x):
+        return 2.0 * weights * x * np.where(np.arange(400) // 8 == 25, 1.5, 1.0)
+
+    report = bench.examine(
+        lambda x: refined(x) + 2e-4 * np.sin(20.0 * x).sum(), theta, grad=gradient, refined=refined, calls=6000
+    )
+    assert report.derivative == "wrong"

@@ -237,7 +237,10 @@ def test_page_and_drawings_follow_the_theme_of_the_system(shown, dark):
 
 
 def test_a_drawing_says_what_it_is_has_texts_of_12_pixels_and_shares_no_id(shown):
-    assert shown.do(f"[{SVG}.role, {SVG}.ariaLabel]") == ["img", "How does the error of one estimate depend on stiffness?"]
+    assert shown.do(f"[{SVG}.role, {SVG}.ariaLabel]") == [
+        "img",
+        "How does the error of one estimate depend on stiffness?",
+    ]
     texts = "[...document.querySelectorAll('.drawing:not(.narrow) text')].filter((one) => !one.querySelector('tspan'))"
     sizes = f"{texts}.map((one) => parseFloat(getComputedStyle(one).fontSize) * Math.hypot(one.getScreenCTM().c, one.getScreenCTM().d))"
     assert min(shown.do(sizes)) >= 12

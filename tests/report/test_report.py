@@ -221,6 +221,12 @@ def test_beyond_a_named_value_the_chart_is_shaded():
     assert [(mark.name, mark.at, mark.to) for mark in plain.marks] == [("beyond the step size limit", 6400.0, math.inf)]
 
 
+def test_where_no_method_reaches_an_error_no_table_of_times_is_drawn():
+    """It was an internal error after the run."""
+    rows = table([row(samples=n, bias=1.0, bias_low=0.9, variance=4.0, time_s=1e-3) for n in (4, 16, 64)])
+    assert "speed_accuracy" not in drawn(rows, ["samples"])
+
+
 def test_nothing_swept_gives_a_table_of_estimators_and_problems():
     rows = table(
         [row(estimator=e, backend=b, scene=s) for e in NAMES for b in BACKENDS for s in ("pushing", "heaviside")]
