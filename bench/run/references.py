@@ -42,7 +42,7 @@ class References:
                 name: np.array(value, dtype=np.float64) for name, value in found.items() if isinstance(value, list)
             }
             reference = Reference(**{**found, **lists})
-            if reference.batches.ndim == 2 and reference.batches.size and 0.0 * reference.error == 0.0:
+            if reference.batches.ndim == 2 and reference.batches.size and isinstance(reference.error, float):
                 return reference
         return None
 

@@ -281,7 +281,7 @@ def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Cha
         return None
     target, backends = TARGETS[0], shown.experiment.compares.get("backends", ())
     lead = best[(best["by"] == "time") & (best["relative error"] == target)].set_index("problem")
-    lines = [
+    lines: list[dict[str, Any]] = [
         {"problem": problem.title(), "series": name.partition(" on ")[0], "backend": name.partition(" on ")[2], "cost": needed.cost,
          "sign": "<" * (needed.how == "at once"), "leads": name in (lead["fastest"][problem.title()], *lead["tied"][problem.title()])}
         for problem in split_by_problem(shown, SAMPLES, ("scene",)) if problem.title() in lead.index
