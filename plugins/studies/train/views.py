@@ -16,6 +16,7 @@ from bench.experiment.columns import Column, interval, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Table, Views
 from bench.measure.performance import bootstrap, interquartile_mean
+from bench.measure.statistics import ends
 from bench.report.colours import method_styles
 from bench.report.problems import problem_names
 from bench.report.views import arrange, attempted
@@ -224,7 +225,7 @@ def middle_with_interval(name: str, values: np.ndarray) -> dict[str, Any]:
     low = high = np.full(values.shape[1:], math.nan)[()]
     if len(values) >= MIN_SEEDS:
         low, high = bootstrap([values], _middle)
-    return dict(zip((name, f"{name}_low", f"{name}_high"), (_middle([values]), low, high), strict=True))
+    return ends(name, (_middle([values]), low, high))
 
 
 def _middle(drawn: Sequence[np.ndarray]) -> Any:
