@@ -92,6 +92,8 @@ class Watch:
         self._before = np.empty(0)
         self._began = time.perf_counter()
         self._spent = self._longest = 0.0
+        self._written = 0
+        self._unwritten = ""
 
     def __call__(self, theta: Any, gradient: Any, w: Any = None) -> None:
         """Count an iteration; if it is due, note the gradient's norm, and check the gradient if the share of time allows.
@@ -128,12 +130,13 @@ class Watch:
         self.rows.append(row)
         if not self.out:
             return
+        lines = [COLUMNS, *(row.values() for row in self.rows)]
         try:
-            is_started = len(self.rows) > 1
-            with self.out.open("a" if is_started else "w", newline="") as file:
-                csv.writer(file).writerows([COLUMNS, row.values()][is_started:])
+            with self.out.open("a" if self._written else "w", newline="") as file:
+                csv.writer(file).writerows(lines[self._written :])
+            self._written, self._unwritten = len(lines), ""
         except OSError as error:
-            row["reason"] = f"{self.out} cannot be written: {error}"
+            self._unwritten = f", {self.out} cannot be written: {error}"
 
     def _measure(self, row: dict[str, Any], theta: Any, gradient: Any, w: Any) -> None:
         """Add what is known of theta and its gradient to a row."""
@@ -188,7 +191,7 @@ class Watch:
     def __str__(self) -> str:
         checks = f"{sum(row['costs'] > 0 for row in self.rows)} of {self.iteration + 1} iterations checked"
         failed = [row for row in self.rows if row["reason"]]
-        text = f"{checks}, {len(failed)} not: {failed[0]['reason']}" if failed else checks
+        text = (f"{checks}, {len(failed)} not: {failed[0]['reason']}" if failed else checks) + self._unwritten
         if self.first is None:
             return f"{text}: no fault of the gradient"
         iteration, code = self.first

@@ -35,6 +35,8 @@ def short_names(names: Iterable[str], is_whole: bool = False) -> dict[str, str]:
     fobg; fobg, mirrored; fobg (numpy); finite difference, step 1e5; finite difference, step 10
     >>> show("gap [m]", "|dx_k+1 / dx_k|", "theta[0]", "first order, step 5 ms", "dt = 1/480 s")
     gap [m]; |dx_k+1 / dx_k|; theta[0]; first order, step 5 ms; dt = 1/480 s
+    >>> show("a[descent=fast]", "a[descent=0.5]")
+    a, descent fast; a, after 50% of a descent
     >>> show("a_b", "a b")
     a_b; a b
     >>> short_names(["smoothing[draws=orthogonal]"], is_whole=True)
@@ -73,7 +75,7 @@ def _parts(name: str) -> dict[tuple[str, str], str]:
 def setting(key: str, value: str) -> str:
     """Return a parameter as words: ``mirrored``, ``draws sobol``, ``after 90% of a descent``."""
     number = pd.to_numeric(value, errors="coerce")
-    if key == "descent":
+    if key == "descent" and number == number:
         return f"after {number:.0%} of a descent" if number else "at the start"
     return f"{key} {axis_value(number) if number == number else value}".removesuffix(" true").replace("_", " ")
 

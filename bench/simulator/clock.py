@@ -31,8 +31,8 @@ class OutOfTime(BaseException):
 def parse_duration(budget: float | str, what: str = "budget") -> float:
     """Return a budget such as ``60``, ``"60s"`` or ``"2m"`` in seconds; raises :class:`UserError` if invalid.
 
-    >>> parse_duration("2m"), parse_duration(0.5)
-    (120.0, 0.5)
+    >>> parse_duration("2m"), parse_duration("2M"), parse_duration(0.5)
+    (120.0, 120.0, 0.5)
     """
     text = str(budget).strip().lower()
     number = text.rstrip("abcdefghijklmnopqrstuvwxyz ")

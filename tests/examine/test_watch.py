@@ -169,3 +169,11 @@ def test_neither_a_theta_that_is_none_nor_a_full_disk_ends_the_loop(tmp_path):
     assert [row["iteration"] for row in log.rows] == [0, 2]
     assert log.first is None
     assert "log.csv" in str(log)
+    log(np.array([np.nan, 1.0]), np.ones(2))
+    assert log.first == (4, "not_finite")
+    (tmp_path / "missing").mkdir()
+    for _ in range(2):
+        log(np.ones(2), 2 * np.ones(2))
+    with (tmp_path / "missing" / "log.csv").open() as file:
+        assert [row["iteration"] for row in csv.DictReader(file)] == ["0", "2", "4", "6"]
+    assert "log.csv" not in str(log)

@@ -37,6 +37,7 @@ def tree(tmp_path_factory):
     made.add("plugins/estimators/half_step.py", ESTIMATOR.format(name="half_step", requires=""))
     absent = ESTIMATOR.format(name="absent", requires='"no_such_module=some-dist",')
     made.add("plugins/estimators/absent.py", absent)
+    made.add("plugins/.half_step.py", "an editor's copy")
     made.install(
         "third_party",
         ESTIMATOR.format(name="third_name", requires=""),
@@ -86,6 +87,10 @@ def test_added_plugins_run_and_take_parameters_from_the_command_line(rows):
     assert rows.loc["half_step", "estimator_params"] == "factor=0.5"
     assert rows.loc["half_step", "grad_norm"] == pytest.approx(rows.loc["fobg", "grad_norm"] / 2)
     assert rows.loc["third_name", "grad_norm"] == rows.loc["fobg", "grad_norm"]
+
+
+def test_a_hidden_file_is_no_plugin(listing):
+    assert ".half_step" not in listing
 
 
 @pytest.mark.parametrize(

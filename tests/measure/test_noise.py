@@ -74,6 +74,15 @@ def test_units_are_independent_and_mirrored_draws_hold_the_own_noise(design):
         np.testing.assert_array_equal(drawn[:, 1::2, 2:], drawn[:, ::2, 2:])
 
 
+def test_kept_noise_has_a_bound_and_gives_what_is_drawn(monkeypatch):
+    monkeypatch.setattr(noise, "_kept", kept := {})
+    monkeypatch.setattr(noise, "BLOCKS", 2)
+    for seed in (1, 2, 3, 1):
+        given = KEY | {"seed": seed}
+        np.testing.assert_array_equal(noise.shared(**given), noise.draw(**given))
+        assert len(kept) <= 2
+
+
 def test_mirrored_draws_are_the_first_half_of_the_independent_ones():
     half = noise.draw(**KEY | {"samples": 4})
     np.testing.assert_array_equal(noise.draw(**KEY | {"samples": 8}, design=Design(mirrored=True))[:, ::2], half)

@@ -11,6 +11,7 @@ from bench.plugins.studies.bias_variance.comparisons import (
     WORKS,
     at_equal_rollouts,
     compare_errors,
+    declares,
     lowest,
     method_table,
     ratio,
@@ -139,6 +140,11 @@ def test_costs_of_several_rollouts_per_sample_are_compared_at_equal_rollouts():
         ["rollouts", at, "fobg", "reinforce"] for at in (128.0, 256.0)
     ]
     assert compared["factor"].tolist() == pytest.approx([math.sqrt(2) / 1.2] * 2, rel=1e-3)
+
+
+def test_a_fact_that_depends_on_parameters_is_that_of_the_plugin():
+    rows = table([row(estimator="reinforce"), row(estimator="randomized_smoothing")])
+    assert declares(rows, "separable").tolist() == [False, True]
 
 
 RESCALED = {0.0: math.sqrt(2.0), 0.2: math.hypot(0.2, 0.3 * math.sqrt(2.0)) / math.hypot(0.2, 0.3)}

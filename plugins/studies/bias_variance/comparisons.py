@@ -112,9 +112,11 @@ def has_law(rows: pd.DataFrame) -> pd.Series:
 
 def declares(rows: pd.DataFrame, fact: str) -> pd.Series:
     """Return whether the estimator of each row declares a fact, such as ``fixed_work``."""
-    plugins = {name: entry.plugin for name, entry in registry.entries()["estimators"].items()}
-    known = {name: bool(getattr(plugins.get(name), fact, False)) for name in rows["estimator"].unique()}
-    return rows["estimator"].map(known).astype(bool)
+    names = {name for name, entry in registry.entries()["estimators"].items() if entry.available}
+    declared = {
+        name: bool(getattr(registry.make("estimators", name), fact, False)) for name in names & {*rows["estimator"]}
+    }
+    return rows["estimator"].map(declared).eq(True)
 
 
 def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:

@@ -53,12 +53,12 @@ def tables(shown: Arranged) -> list[Table]:
     ]
     errors = attempted(merge_seeds(shown.rows))
     errors = errors[np.isfinite(errors["start_norm"])]
+    numbers = ["samples"] * (errors["samples"].nunique() > 1) + [DESCENT]
+    order = ["problem", "method", "backend", *numbers]
     errors = errors.assign(
         problem=_named(shown, ("scene", "contact", "integrator"), errors), method=estimator_labels(errors)
-    )[["problem", "method", "backend", DESCENT, *SHOWN]].sort_values(
-        ["problem", "method", "backend", DESCENT], ignore_index=True
-    )
-    columns = [*(COLUMNS.by_name[name] for name in (DESCENT, *SHOWN[:3], "reference_norm"))]
+    )[[*order, *SHOWN]].sort_values(order, ignore_index=True)
+    columns = [*(COLUMNS.by_name[name] for name in (*numbers, *SHOWN[:3], "reference_norm"))]
     return [
         Table("descent", found, [text("problem"), *PATH], "the descents along which gradients are taken", notes),
         Table(
