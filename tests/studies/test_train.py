@@ -92,6 +92,15 @@ def test_a_setting_without_a_tuning_run_is_not_chosen():
     assert verdicts_of(experiment, rows) == {"shac": "first", "shac[window=8]": "not chosen", "ppo": "behind"}
 
 
+def test_settings_are_chosen_on_the_seeds_that_all_of_them_have():
+    """The longer window ends highest on the shared seeds, and lower with those that the shorter does not have."""
+    experiment, rows = made_up({"shac": -400.0, "shac[window=8]": -410.0, "ppo": -900.0}, range(10), spread=1.0)
+    unshared = rows["seed"].isin([2, 3])
+    rows.loc[(rows["trainer"] == "shac") & unshared, "final_return"] -= 300.0
+    rows = rows[(rows["trainer"] != "shac[window=8]") | ~unshared]
+    assert verdicts_of(experiment, rows) == {"shac": "first", "shac[window=8]": "not chosen", "ppo": "behind"}
+
+
 def test_few_seeds_give_no_interval_and_no_order():
     experiment, rows = made_up(seeds=range(4))
     shown = studied.views(experiment, rows)
