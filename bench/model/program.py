@@ -422,51 +422,50 @@ class Rollout(Program):
     def start(self, ops: Ops, theta: Array, w: Array) -> tuple[Array, State, tuple[Array, ...]]:
         """Return theta plus its noise, the initial state, and the control law's inputs, each ``(horizon, n_u, B)``.
 
-        The inputs are the open-loop controls, if any, then the noise on the actions.
+        The input is the open-loop controls plus the noise on the actions, if there are any.
         """
         scene, xp = self.scene, ops.xp
-        shape = (scene.horizon, scene.n_u, w.shape[1])
-        n_own = self.n_noise - self.exogenous
-        own, e = (w[:n_own], w[n_own:]) if self.exogenous else (w, None)
-        scanned = []
-        if self.action_noise:
-            scanned.append(scene.held(xp, xp.reshape(own, (scene.controls, *shape[1:]))))
-        else:
+        own, e = (w[: -self.exogenous], w[-self.exogenous :]) if self.exogenous else (w, None)
+        if not self.action_noise:
             theta = theta + scene.sigma * own
         planned = scene.planned_controls(xp, theta)
-        if planned is not None:
-            scanned.insert(0, xp.broadcast_to(planned, shape))
+        scanned = [] if planned is None else [xp.broadcast_to(planned, (*planned.shape[:2], w.shape[1]))]
+        if self.action_noise:
+            noise = scene.sigma * self.drawn_actions(xp, w)
+            scanned = [noise if planned is None else planned + noise]
         start = scene.starting_state(xp, theta, e)
         # theta (d, 1) yields a single column, but the scan's carry needs all B columns
         state = State(*(xp.broadcast_to(part, (part.shape[0], w.shape[1])) for part in start))
         return theta, state, tuple(scanned)
 
+    def drawn_actions(self, xp: Any, w: Array) -> Array:
+        """Return the normal numbers whose multiples by sigma are the noise on the actions, ``(horizon, n_u, B)``."""
+        count = self.scene.controls
+        return self.scene.held(xp, xp.reshape(w[: count * self.scene.n_u], (count, self.scene.n_u, w.shape[1])))
+
     def control(self, ops: Ops, theta: Array, state: State, slices: tuple[Array, ...]) -> Array:
-        """Return u_t = plan + feedback + sigma w_t, ``(n_u, B)``."""
+        """Return u_t = plan + sigma w_t + feedback, ``(n_u, B)``."""
         scene, xp = self.scene, ops.xp
-        parts = list(slices)
-        if self.action_noise:
-            parts[-1] = scene.sigma * parts[-1]
         back = scene.feedback(xp, theta, state.q, state.v)
-        if back is not None:
-            parts.append(back)
+        parts = slices if back is None else (*slices, back)
         return sum(parts[1:], parts[0]) if parts else xp.zeros((scene.n_u, state.v.shape[1]), dtype=state.v.dtype)
 
     def _rollout(self, ops: Ops, theta: Array, w: Array, theta_scored: Array | None) -> tuple[Array, Array]:
         scene, xp = self.scene, ops.xp
-        theta, state, scanned = self.start(ops, theta, w)
         planned_scored = None if theta_scored is None else scene.planned_controls(xp, theta_scored)
-        extra = () if planned_scored is None else (planned_scored,)
+        drawn = () if theta_scored is None else (self.drawn_actions(xp, w),)
+        theta, state, scanned = self.start(ops, theta, w)
+        extra = drawn if planned_scored is None else (*drawn, planned_scored)
         # a scan's carry must have a constant shape and type
         zero = xp.zeros_like(w[0, :])
 
         def step(carry: tuple[State, Array, Array], slices: tuple[Array, ...]) -> tuple[State, Array, Array]:
             state, cost, logp = carry
-            drawn = slices[: len(scanned)]
-            u = self.control(ops, theta, state, drawn)
+            u = self.control(ops, theta, state, slices[: len(scanned)])
             if theta_scored is not None:
-                scored = [*slices[len(scanned) :], scene.feedback(xp, theta_scored, state.q, state.v)]
-                logp = logp + sum(xp.sum(drawn[-1] * part, axis=0) for part in scored if part is not None)
+                noise, *scored = slices[len(scanned) :]
+                scored.append(scene.feedback(xp, theta_scored, state.q, state.v))
+                logp = logp + sum(xp.sum(noise * part, axis=0) for part in scored if part is not None)
             cost = cost + scene.stage_cost(xp, state.q, state.v, u)
             return self.step(ops, state, u), cost, logp
 

@@ -86,8 +86,7 @@ class SteppedProblem(Problem):
         # a held control is drawn once and acts at each of its steps
         scale = program.scene.sigma * (program.scene.horizon // program.scene.controls)
         with np.errstate(all="ignore"):
-            drawn = program.start(_OPS, theta, w)[2][-1]
-            result = controls_by_theta(program, states, theta, drawn / scale)
+            result = controls_by_theta(program, states, theta, program.drawn_actions(np, w) / scale)
         return np.where(np.isfinite(states).all(axis=(0, 1)), result, np.nan)
 
 

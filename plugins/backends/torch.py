@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -31,13 +30,6 @@ class TorchOps(LoopOps):
         import array_api_compat.torch
 
         super().__init__(array_api_compat.torch)
-
-    def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        # unbind adds one graph node for all steps, while indexing would add one per step
-        slices = [x.unbind(0) for x in xs]
-        for t in range(length):
-            carry = step(carry, tuple(x[t] for x in slices))
-        return carry
 
 
 class TorchProblem(Problem):

@@ -30,10 +30,13 @@ class Penalty(ForceLaw):
         return self.stiffness, self.damping
 
     def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
-        damper = -self.damping * gap_rate
-        if self.damping_mode == "approach":
-            damper = xp.where(damper > 0, damper, 0.0)
-        force = damper - self.stiffness * gap
-        if self.damping_mode == "clipped":
-            force = xp.where(force > 0, force, 0.0)
+        force = -self.stiffness * gap
+        # without damping the spring acts alone; a compiled program and theta have the damping as an array
+        if not isinstance(self.damping, float) or self.damping:
+            damper = -self.damping * gap_rate
+            if self.damping_mode == "approach":
+                damper = xp.where(damper > 0, damper, 0.0)
+            force = damper + force
+            if self.damping_mode == "clipped":
+                force = xp.where(force > 0, force, 0.0)
         return xp.where(gap < 0, force, 0.0)

@@ -26,9 +26,9 @@ class Clipped(Descent):
             return gradient
         if self.clip_by == "element":
             return np.clip(gradient, -self.clip, self.clip)
-        norm = float(np.linalg.norm(gradient))
+        norm = np.linalg.norm(gradient)
         return gradient if norm <= self.clip else gradient * (self.clip / norm)
 
     def rate_at(self, iteration: int) -> float:
         """Return the rate of an iteration, counted from 1."""
-        return float(self.rate / iteration**self.decay)
+        return self.rate / iteration**self.decay

@@ -30,7 +30,7 @@ class Lbfgs(Searching):
         return super().start(theta) | {"steps": [], "changes": [], "last": None}
 
     def with_gradient(self, state: OptimizerState, gradient: np.ndarray) -> OptimizerState:
-        steps, changes = list(state["steps"]), list(state["changes"])
+        steps, changes = state["steps"], state["changes"]
         if state["last"] is not None:
             s, y = state["theta"] - state["last"][0], gradient - state["last"][1]
             if y @ s > 1e-10 * np.linalg.norm(y) * np.linalg.norm(s):
@@ -43,10 +43,10 @@ class Lbfgs(Searching):
         }
 
     def direction(self, state: OptimizerState) -> np.ndarray:
-        q = np.array(state["gradient"])
+        q = state["gradient"]
         pairs = list(zip(state["steps"], state["changes"], strict=True))
         if not pairs:
-            return -q * (self.first_move / max(float(np.linalg.norm(q)), 1e-300))
+            return -q * (self.first_move / (np.linalg.norm(q) + 1e-300))
         shares = []
         for s, y in reversed(pairs):
             shares.append((s @ q) / (y @ s))

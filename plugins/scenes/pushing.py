@@ -39,7 +39,7 @@ class Pushing(EngineTwin, OpenLoopScene, ZeroOrderHoldScene, DampedScene, Contac
         return State(xp.stack([zero, zero + 1.0]), xp.stack([zero + self.speed, zero]))
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        return xp.stack([u[0] / self.mass, 0.0 * u[0]])
+        return xp.concat([u / self.mass, xp.zeros_like(u)])
 
     def gap(self, xp: Any, q: Array) -> Array:
         """Return x2 - x1 - 1."""
@@ -50,7 +50,7 @@ class Pushing(EngineTwin, OpenLoopScene, ZeroOrderHoldScene, DampedScene, Contac
         return v[1:2] - v[0:1]
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        return xp.stack([-force[0] / self.mass, force[0] / self.mass])
+        return xp.concat([-force, force]) / self.mass
 
     def mjcf(self) -> str:
         """Return two spheres of radius 0.5 m on a line, with joint damping (1 - velocity_factor) m / dt."""
@@ -70,8 +70,11 @@ class Pushing(EngineTwin, OpenLoopScene, ZeroOrderHoldScene, DampedScene, Contac
             <actuator><motor joint="first"/></actuator>"""
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        return (self.terminal_cost(xp, q, v) + u[0] * u[0]) / self.hold
+        push = u[0]
+        cost = self.terminal_cost(xp, q, v) + push * push
+        return cost if self.hold == 1 else cost / self.hold
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
         """Return the squared distance to x = (1, 2), v = (speed, 0), weighted by (0.1, 10, 0.1, 0.1)."""
-        return 0.1 * (q[0] - 1.0) ** 2 + 10.0 * (q[1] - 2.0) ** 2 + 0.1 * (v[0] - self.speed) ** 2 + 0.1 * v[1] ** 2
+        (x1, x2), (v1, v2) = q, v
+        return 0.1 * (x1 - 1.0) ** 2 + 10.0 * (x2 - 2.0) ** 2 + 0.1 * (v1 - self.speed) ** 2 + 0.1 * v2**2
