@@ -20,8 +20,6 @@ HELD = 1 << 22
 """Most normal numbers that a cell stores in memory (32 MiB). A cell that needs more draws them in parts."""
 KEPT = 4 * HELD
 """Most normal numbers that are kept for cells and references with the same noise."""
-BLOCKS = 8
-"""Most blocks of noise that are kept."""
 
 _kept: dict[tuple[object, ...], np.ndarray] = {}
 
@@ -40,7 +38,7 @@ def shared(
         block = draw(*given)
         if block.size > HELD:
             return block
-        while len(_kept) >= BLOCKS or sum(kept.size for kept in _kept.values()) > KEPT - block.size:
+        while sum(kept.size for kept in _kept.values()) > KEPT - block.size:
             del _kept[next(iter(_kept))]
     _kept[given] = block
     own = block.copy(order="K")

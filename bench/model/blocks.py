@@ -43,8 +43,11 @@ def _n_listed(ranges: str) -> int:
 
 
 def columns_in_cache(column_bytes: int) -> int:
-    """Return the number of columns that fill half of a core's cache, within limits."""
-    columns = cache_bytes() // 2 // max(column_bytes, 1)
+    """Return the power of 2 of columns that fill at most half of a core's cache, within limits.
+
+    Batches of several sizes then have blocks of one size, for which a program is compiled once.
+    """
+    columns = 1 << max(cache_bytes() // 2 // max(column_bytes, 1), 1).bit_length() - 1
     # larger blocks save no time
     return min(max(columns, MIN_COLUMNS), 1 << 14)
 
@@ -83,7 +86,7 @@ def evaluate(
     def block(start: int) -> None:
         part = slice(start, min(start + columns, count))
         shared = theta.shape[1] == 1
-        values = function(theta if shared else _pad(theta[:, part], columns), _pad(w[:, part], columns))
+        values = function(theta if shared else padded(theta[:, part], columns), padded(w[:, part], columns))
         result[..., part] = values[..., : part.stop - part.start]
 
     # one pool per process: a forked child inherits the pool but not its threads
@@ -92,7 +95,7 @@ def evaluate(
     return result
 
 
-def _pad(part: np.ndarray, columns: int) -> np.ndarray:
+def padded(part: np.ndarray, columns: int) -> np.ndarray:
     """Return ``part`` padded to ``columns`` columns by repeating its last column."""
     missing = columns - part.shape[1]
     return np.concatenate([part, np.repeat(part[:, -1:], missing, axis=1)], axis=1) if missing else part

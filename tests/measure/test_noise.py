@@ -76,7 +76,7 @@ def test_units_are_independent_and_mirrored_draws_hold_the_own_noise(design):
 
 def test_kept_noise_has_a_bound_and_gives_what_is_drawn(monkeypatch):
     monkeypatch.setattr(noise, "_kept", kept := {})
-    monkeypatch.setattr(noise, "BLOCKS", 2)
+    monkeypatch.setattr(noise, "KEPT", 2 * noise.draw(**KEY).size)
     for seed in (1, 2, 3, 1):
         given = KEY | {"seed": seed}
         np.testing.assert_array_equal(noise.shared(**given), noise.draw(**given))
