@@ -14,15 +14,12 @@ from typing import Any, cast
 
 import pandas as pd
 from bench.plugins.studies.bias_variance.comparisons import FAILS, OPEN
-from PIL import Image
 
 import bench
 import bench.plugin
 from bench.errors import UserError
 from bench.host.parameters import parameters
 from bench.model import registry
-from bench.report.draw import NARROW
-from bench.report.figures import DPI
 from bench.report.tables import escape_markdown
 from bench.report.text import number
 from docs.figures import without_marks
@@ -206,10 +203,8 @@ def experiment_page(entry: Entry) -> str:
 
 
 def picture(path: Path, description: str) -> str:
-    """Return a chart of an experiment; one of several panels is not made smaller on phones, but scrolls."""
-    with Image.open(path) as image:
-        look = "{.wide}\n" if image.width > DPI * NARROW else ""
-    return f"{look}![{escape_markdown(description)}](/data/{path.parent.name}/{path.name})"
+    """Return a chart of an experiment."""
+    return f"![{escape_markdown(description)}](/data/{path.parent.name}/{path.name})"
 
 
 LONGEST = 30

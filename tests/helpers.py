@@ -223,6 +223,17 @@ def experiment(
     )
 
 
+def swept(rows, **given):
+    """Return an experiment for reports of made-up rows, by default along their stiffnesses, as :func:`experiment` does."""
+    return experiment(**{"sweep": {"stiffness": sorted(map(float, rows["stiffness"].unique()))}} | given)
+
+
+def charts_of(rows, **given):
+    """Return the charts of made-up rows by name, of the experiment of :func:`swept`."""
+    shown = swept(rows, **given)
+    return {chart.name: chart for chart in shown.study.views(shown, rows).charts}
+
+
 def need_backends(*names):
     """Skip the tests of a module unless these backends are available."""
     for name in names:

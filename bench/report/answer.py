@@ -104,12 +104,7 @@ def _percents(rows: pd.DataFrame, column: str) -> str:
 
 def _ends(text: Callable[[float], str]) -> Callable[[pd.DataFrame, str], str]:
     """Return the function that formats the least and the largest value, or one of them where both print the same."""
-
-    def ends(rows: pd.DataFrame, column: str) -> str:
-        values = _finite(rows, column)
-        return " to ".join(dict.fromkeys((text(values.min()), text(values.max()))))
-
-    return ends
+    return lambda rows, column: " to ".join(dict.fromkeys(map(text, np.sort(_finite(rows, column))[[0, -1]])))
 
 
 FORMATS: dict[str, Callable[[pd.DataFrame, str], str]] = {

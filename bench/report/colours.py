@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from itertools import count
 
@@ -14,7 +15,7 @@ import pandas as pd
 from bench.experiment.config import config_dir
 from bench.experiment.views import Chart, Style
 from bench.model import registry
-from bench.report.style import MARKERS, VARIANTS, colour, marker
+from bench.report.style import VARIANTS, colour, marker
 
 BESIDE = (7, 4, 3, 2, 1, 6, 5, 0)
 """Places in the palette of trainers and of searches by costs: first those that few estimators have, since both share charts."""
@@ -28,10 +29,18 @@ def looks_by_name(charts: Sequence[Chart]) -> dict[str, Style]:
     taken = {style.colour for style in given.values()}
     free = (place for place in count() if colour(place) not in taken)
     others = (name for name in dict.fromkeys(drawn) if name not in given)
-    found = given | {
-        name: Style(colour(place), MARKERS[place % len(MARKERS)]) for name, place in zip(others, free, strict=False)
-    }
+    found = given | {name: _look(place) for name, place in zip(others, free, strict=False)}
     return {name: style for name, style in found.items() if name in drawn}
+
+
+def nested(names: Iterable[str]) -> dict[str, Style]:
+    """Return looks in which lines and points on top of each other are all seen: each later one is thinner and smaller."""
+    every = [*names]
+    return {name: replace(_look(i), width=1.2 * (len(every) - i)) for i, name in enumerate(every)}
+
+
+def _look(place: int) -> Style:
+    return Style(colour(place), marker(place))
 
 
 def graded(

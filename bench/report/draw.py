@@ -49,7 +49,7 @@ USELESS = 1e2
 """Where a value above 1 means a failure, larger values are drawn here with their number."""
 CUT = SIZE + 1
 """Height of the line of such a number, in points."""
-HOLLOW: dict[str, Any] = {"markerfacecolor": "white"}
+HOLLOW: dict[str, Any] = {"markerfacecolor": "none"}
 NEAR = 20.0
 """Distance from which an arrow joins two points, in hundredths of an inch."""
 LIMIT: dict[str, Any] = {"color": "#000000", "linewidth": 1.4}
@@ -112,8 +112,8 @@ def draw(chart: Chart, is_narrow: bool = False) -> Figure:
             scaled = part if stacked and chart.across == 1 else chart.frame
             _draw_lines(chart, panel, part, styles, y, _is_log(y, scaled[y.name]))
             few = all(p[chart.x[0].name].nunique() <= 6 for _, p in parts)
-            _scale_x(panel, chart.x[0], chart.frame if stacked else part, few)
-            _scale_values(chart, panel, "y", y, scaled)
+            _scale(chart, panel, "x", chart.x[0], chart.frame if stacked else part, few)
+            _scale(chart, panel, "y", y, scaled)
             if y is not chart.y[0]:
                 panel.margins(y=0.4)
             elif chart.arrow:
@@ -215,15 +215,30 @@ def _is_log(column: Column, values: Any) -> bool:
     return column.log and bool((np.isfinite(values) & (values > 0)).any())
 
 
-def _scale_values(chart: Chart, panel: Axes, which: Literal["x", "y"], column: Column, rows: pd.DataFrame) -> None:
-    """Set the scale of the drawn quantity by its values in ``rows``, and shade the area above 1 where that means something."""
-    if _is_log(column, rows[column.name]):
+def _scale(
+    chart: Chart, panel: Axes, which: Literal["x", "y"], column: Column, rows: pd.DataFrame, few: bool = False
+) -> None:
+    """Set the scale of an axis by its values in ``rows``, with a label at each if they are ``few``.
+
+    The area above 1 is shaded where that means something.
+    """
+    axis, values = panel.xaxis if which == "x" else panel.yaxis, rows[column.name]
+    if not pd.api.types.is_numeric_dtype(values):
+        axis.set_tick_params(rotation=30)
+        return
+    places = np.unique(values[np.isfinite(values)])
+    if _is_log(column, values):
         low, high = _log_range(column, rows, [mark for mark in chart.marks if mark.axis == which])
-        log_axis(panel, which, low, high, text=_values_text(column, 0.0))
+        log_axis(
+            panel, which, low, high, places if few and column.format == "setting" else (), _values_text(column, 0.0)
+        )
         if column.above_one and high > 1:
             (panel.axvspan if which == "x" else panel.axhspan)(1.0, high, zorder=0, label=column.above_one, **SHADE)
-    elif text := _values_text(column, rows[column.name].abs().max()):
-        (panel.xaxis if which == "x" else panel.yaxis).set_major_formatter(lambda value, _: text(value))
+        return
+    if few:
+        axis.set_major_locator(FixedLocator(list(places)))
+    if text := _values_text(column, np.abs(places).max(initial=0.0)):
+        axis.set_major_formatter(lambda value, _: text(value))
 
 
 def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[Mark] = ()) -> tuple[float, float]:
@@ -238,24 +253,6 @@ def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[Mark] = ()) -
     every = [low, high, *ends, *(mark.at for mark in marks)]
     margin = max((max(every) / min(every)) ** 0.06, 1.15)
     return min(every) / margin, max(every) * margin
-
-
-def _scale_x(panel: Axes, column: Column, rows: pd.DataFrame, few: bool) -> None:
-    """Set the scale of x, with a label at each of the values if all panels have ``few``."""
-    values = rows[column.name]
-    if not pd.api.types.is_numeric_dtype(values):
-        panel.tick_params(axis="x", rotation=30)
-        return
-    places = np.unique(values[np.isfinite(values)])
-    text = _values_text(column, places.max(initial=0.0))
-    if _is_log(column, places) and (places > 0).all():
-        wanted = places if few and column.format == "setting" else ()
-        log_axis(panel, "x", *_log_range(column, rows), wanted, _values_text(column, 0.0))
-        return
-    if few:
-        panel.xaxis.set_major_locator(FixedLocator(list(places)))
-    if text:
-        panel.xaxis.set_major_formatter(lambda value, _: text(value))
 
 
 def _draw_marks(chart: Chart, panel: Axes, name: str) -> None:
@@ -295,8 +292,10 @@ def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str
     for _, points in part.groupby(chart.arrow, sort=False):
         ends = np.array([points[x.name], points[y.name].clip(y.least, USELESS)], dtype=float).T
         if np.ptp(panel.transData.transform(ends), axis=0).max() > NEAR:
-            look = {"arrowstyle": "-|>", "color": styles[str(points[chart.series].iloc[0])].colour, "linewidth": 1.6}
-            panel.annotate("", ends[-1], ends[0], arrowprops=look, zorder=2)
+            colour = styles[str(points[chart.series].iloc[0])].colour
+            panel.annotate(
+                "", ends[-1], ends[0], arrowprops={"arrowstyle": "-|>", "color": colour, "linewidth": 1.6}, zorder=2
+            )
             _name(panel, chart.arrow_name, marker="$\u2192$", markersize=10)
 
 
@@ -328,23 +327,25 @@ def _draw_values(
     def plot(at: Any, value: Any, **more: Any) -> None:
         panel.plot(*((value, at) if is_flat else (at, value)), **look | more)
 
+    is_hollow, size = limit & bool(marker), 2.55 + 1.5 * style.width
     plot(
         places,
-        values,
+        np.where(is_hollow, math.nan, values),  # no line joins a limit to a value
         marker=marker,
         linestyle=style.line if chart.kind == "lines" else "none",
         linewidth=style.width,
+        markersize=size,
         drawstyle="steps-post" if chart.steps else "default",
         label=plain(style.meaning),
     )
-    if marker and limit.any():
-        plot(places[limit], values[limit], marker=marker, linestyle="none", **HOLLOW)
+    if is_hollow.any():
+        plot(places[limit], values[limit], marker=marker, linestyle="none", markersize=size, **HOLLOW)
         _name(panel, "upper limit", marker="o", **HOLLOW)
     if column.low and column.high:
         low, high = (points[end].to_numpy(float) for end in (column.low, column.high))
         if log:
             low, high = np.maximum(low, SMALLEST), np.minimum(high, LARGEST)
-        known = np.isfinite(values + low + high) & ~limit
+        known = np.isfinite(low + high) & ~limit
         if known.any():
             mark = "s" if chart.band else "_" if is_flat else "|"
             _name(panel, column.ends, marker=mark, markersize=9, alpha=0.3 if chart.band else 1.0)
@@ -378,12 +379,8 @@ def _draw_dots(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, 
     if chart.join:
         for category, points in part.groupby(part[y.name].astype(str), sort=False):
             ends = points[x.name].clip(x.least)
-            look: dict[str, Any] = {
-                "color": styles[str(points[chart.series].iloc[-1])].colour,
-                "alpha": 0.45,
-                "linewidth": 1.8,
-            }
-            panel.hlines(place[str(category)], ends.min(), ends.max(), zorder=1, **look)
+            ground = styles[str(points[chart.series].iloc[-1])].colour
+            panel.hlines(place[str(category)], ends.min(), ends.max(), ground, zorder=1, alpha=0.45, linewidth=1.8)
     is_spread = not chart.join and part[y.name].nunique() < len(part)
     for order, (series, style) in enumerate(styles.items()):
         points = part[part[chart.series].astype(str) == series] if chart.series else part
@@ -393,7 +390,7 @@ def _draw_dots(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, 
     panel.grid(axis="y", color="#e4e4e4", linewidth=0.6)
     panel.set_axisbelow(True)
     panel.set_xlabel(plain(x.heading))
-    _scale_values(chart, panel, "x", x, values)
+    _scale(chart, panel, "x", x, values)
 
 
 def _draw_grid(

@@ -26,6 +26,11 @@ class ProblemRows:
     identity: Mapping[str, Any]
     rows: pd.DataFrame
 
+    def parts(self) -> tuple[str, dict[str, Any]]:
+        """Return the texts of the identity as a string, and its numbers by name."""
+        numbers = {name: value for name, value in self.identity.items() if not isinstance(value, str)}
+        return joined({**self.identity, **dict.fromkeys(numbers, "")}), numbers
+
     def title(self) -> str:
         """Return the problem as a string: ``pushing, penalty, sigma=0.1``."""
         return joined(self.identity)

@@ -16,7 +16,7 @@ TICKS = (
 )  # fmt: skip
 """Choices of ticks on a logarithmic axis, finest first: a stride in decades, and the positions within a decade."""
 
-SMALLEST, LARGEST = 1e-290, 1e290
+SMALLEST, LARGEST = 1e-250, 1e250
 """Limits of logarithmic axes: the margins that matplotlib adds must not overflow."""
 
 

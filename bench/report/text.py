@@ -27,6 +27,11 @@ def number(value: float, digits: int = 2) -> str:
     return f"{mantissa}e{power}"
 
 
+def rounded(value: float) -> float:
+    """Return a number as :func:`number` prints it, so that a colour never contradicts its text: 0.999 is 1.0."""
+    return float(number(value)) if math.isfinite(value) else value
+
+
 def apart(value: float, boundary: float, digits: int = 2) -> str:
     """Return a number with at least ``digits`` significant digits, and so many that it does not print as a boundary that it differs from.
 

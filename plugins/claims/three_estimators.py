@@ -29,7 +29,7 @@ class ThreeEstimators(Claim):
         "a parabola, and loses on a fast wave by the square of its frequency."
     )
     source = "Mohamed et al. 2020, JMLR"
-    learned = "No estimator is best: roughness costs the first order, dimension the score."
+    learned = "On a wave the pathwise gradient pays for roughness. The score pays for dimension: no estimator is best."
     quantity = "variance of one sample"
     logarithmic = "xy"
 

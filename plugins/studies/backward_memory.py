@@ -18,6 +18,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Table, Views
 from bench.measure import timing
+from bench.measure.statistics import ends
 from bench.model import param
 
 from . import PARTS, StudyPackage, finite_status, first_batch, relative_error
@@ -151,7 +152,7 @@ def spread(name: str, values: list[float]) -> dict[str, float]:
 
     The range of n independent values contains their distribution's median with probability 1 - 2^(1 - n).
     """
-    return {name: float(np.median(values)), f"{name}_low": min(values), f"{name}_high": max(values)}
+    return ends(name, (float(np.median(values)), min(values), max(values)))
 
 
 # ------------------------------------------------------------------------------------------------- what is shown

@@ -45,8 +45,9 @@ MEDIAN: dict[str, Any] = {
 MEANING = {
     "exploding": "explodes",
     "polynomial": "grows as a power",
+    "growing": "grows, the law is open",
     "vanishing": "vanishes",
-    "open": "open: growth not certain",
+    "open": "open whether it grows",
 }
 """What a verdict says of a curve."""
 VERDICT = (
@@ -63,7 +64,7 @@ VERDICT_NOTE = (
     "Median norms of one sample's gradient against the horizon, fitted by a power law and by an exponential. exploding: the "
     "exponential is at least 20 times as likely as the power law, and its rate is above 0. polynomial: the power law is as "
     "much more likely, or the more likely one where the Jacobian product does not grow, and its order is above 0. "
-    "vanishing: the better curve falls by as much evidence. open: none of these. Intervals are of 95%. A variance is lower where the ranges over "
+    "growing: the order is above 0, by which curve is open. vanishing: the better curve falls by as much evidence. open: none of these. Intervals are of 95%. A variance is lower where the ranges over "
     "repeats from 5% to 95% do not overlap: first at every horizon, zeroth from a horizon on, else open."
 )
 NOTE = (
@@ -255,8 +256,8 @@ def fit(horizons: np.ndarray, norms: np.ndarray, errors: np.ndarray, bounded: bo
         verdict = "exploding"
     elif (odds >= STRONG and rate[2] < 0) or (odds <= 1 / STRONG and order[2] < 0):
         verdict = "vanishing"
-    elif order[1] > 0 and (odds <= 1 / STRONG or (odds <= 1 and bounded)):
-        verdict = "polynomial"
+    elif order[1] > 0:
+        verdict = "polynomial" if odds <= 1 / STRONG or (odds <= 1 and bounded) else "growing"
     return {"verdict": verdict, "odds": odds, **ends("order", order), **ends("rate", rate)}
 
 

@@ -79,16 +79,18 @@ class Solver(StudyPackage):
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
         """Return the table with a line per scene, engine and iterations, and the chart of errors."""
+        from bench.report.colours import nested
         from bench.report.shown import Shown
 
         shown = Shown(experiment, rows)
         cells = shown.cells(
             SHOWN, "gradients along the iterations of the constraint solver", NOTES, ("scene", "backend")
         )
-        iterations = shown.column("iterations", label="iterations of the solver", log=True)
+        iterations = shown.column("iterations", label="iterations of the solver", format="setting", log=True)
         error = shown.column("gradient_error_rel", label="relative error", least=1e-6, log=True)
+        fewer = shown.good[shown.good["iterations"] < self.converged]  # a converged program has no error to itself
         chart = Chart(
-            "solver", shown.good, [iterations], [error], series="method", panel="problem",
-            marks=[Mark("as large as the gradient", 1.0, axis="y")], subtitle="against the gradient of the program with a converged solver",
+            "solver", fewer, [iterations], [error], series="method", panel="problem", styles=nested(fewer["method"].unique()),
+            marks=[Mark("as large as the gradient", 1.0, axis="y")], subtitle=f"against the gradient of the same program after {self.converged} iterations",
         )  # fmt: skip
         return Views([cells], [chart])

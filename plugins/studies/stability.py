@@ -157,7 +157,7 @@ class Stability(StudyPackage):
         shares = Table("stability_shares", shares_of(cells), SHARES, "How often each contact law and step gives the right gradient",
                        SHARE_NOTES, terminal=True, page=True)  # fmt: skip
         columns = [experiment.columns.by_name[name] for name in RESULTS]
-        return Views([shares, whole], charts(cells), arrange(experiment, rows).rows, columns)
+        return Views([shares, whole], charts(cells, self.inaccurate), arrange(experiment, rows).rows, columns)
 
 
 # ---------------------------------------------------------------------------------------------- trajectories
@@ -370,19 +370,15 @@ def oscillator(cell: Cell) -> tuple[float, float, float] | None:
 def stiffness_limit(integrator: Integrator, dt: float, damping: float, factor: float) -> float:
     """Return the stiffness [1/s^2] where the step becomes unstable; 0 if always, inf if nowhere in :data:`REACH`."""
 
-    def unstable(reach: float) -> bool:
-        return spectral_radius(integrator, dt, reach / dt**2, damping, factor) > NEUTRAL
+    from scipy.optimize import brentq
 
-    first = next((i for i, reach in enumerate(REACH) if unstable(reach)), None)
+    def excess(reach: float) -> float:
+        return spectral_radius(integrator, dt, reach / dt**2, damping, factor) - NEUTRAL
+
+    first = next((i for i, reach in enumerate(REACH) if excess(reach) > 0), None)
     if first is None:
         return math.inf
-    if first == 0:
-        return 0.0
-    low, high = REACH[first - 1], REACH[first]
-    for _ in range(40):
-        middle = math.sqrt(low * high)
-        low, high = (low, middle) if unstable(middle) else (middle, high)
-    return float(low) / dt**2
+    return float(brentq(excess, *REACH[first - 1 : first + 1])) / dt**2 if first else 0.0
 
 
 # ------------------------------------------------------------------------------------------------- what is shown
@@ -402,15 +398,13 @@ def cells_of(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     scene, limits = rows.loc[cells.index, "scene"], cast(Stability, experiment.study)
     size = cells["truth_norm"].groupby(scene).transform("max")
     error = cells["relative_error"] * cells["truth_norm"] / size
-    lost = np.where(
-        cells["reason"].str.contains(GROWN) & (cells["grad_norm"] <= limits.diverged * size),
-        "grew",
-        "blows up",
-    )
-    level = np.where(error.isna(), "open", np.where(error <= limits.inaccurate, "right", "wrong"))
-    level = np.where(cells["verdict"].isin(("diverged", "nonfinite")), lost, level)
+    is_lost = cells["verdict"].isin(("diverged", "nonfinite"))
+    grew = cells["reason"].str.contains(GROWN) & (cells["grad_norm"] <= limits.diverged * size)
+    kinds = {"grew": is_lost & grew, "blows up": is_lost, "open": error.isna(), "right": error <= limits.inaccurate}
+    level = np.select([*kinds.values()], [*kinds], "wrong")
+    over = axes_of(shown, "dt", "stiffness")
     return cells.assign(
-        problem=problem_names(shown, PROBLEM, axes_of(shown, "dt", "stiffness"), rows=cells), row=cells.index, error_share=error,
+        problem=problem_names(shown, PROBLEM, over, rows=cells), variant=titled(cells, [axis.column for axis in shown.axes if axis not in over]), row=cells.index, error_share=error,
         level=level, step=titled(cells, ["contact", "integrator"]), scene_name=scene.str.split("[").str[0], dt_ms=1e3 * cells["dt"],
     )  # fmt: skip
 
@@ -429,40 +423,40 @@ def shares_of(cells: pd.DataFrame) -> pd.DataFrame:
     return shares.iloc[order].reset_index(drop=True)
 
 
-def charts(cells: pd.DataFrame) -> list[Chart]:
+def charts(cells: pd.DataFrame, limit: float) -> list[Chart]:
     """Return a map per scene, of the first variant of each law and integrator; of several laws, each with its best integrator."""
-    import pandas as pd
-
     from bench.report.colours import graded
-    from bench.report.text import number
+    from bench.report.names import short_names
+    from bench.report.text import number, rounded
 
-    missing = cells["stiffness"].isna()  # a law without stiffness is the same at each one
-    levels = pd.DataFrame({"stiffness": sorted(cells["stiffness"].dropna().unique()) or [math.nan]})
-    spread = cells[missing].drop(columns="stiffness").merge(levels, how="cross")
-    frame = pd.concat([cells[~missing], spread], ignore_index=True)
+    every = sorted(cells["stiffness"].dropna().unique()) or [math.nan]
+    # a law without stiffness is the same at each one
+    frame = cells.assign(stiffness=[[k] if k == k else every for k in cells["stiffness"]])
+    frame = frame.explode("stiffness", ignore_index=True).astype({"stiffness": float})
     worst = frame["error_share"].fillna(math.inf).where(frame["level"] != "open", -1.0)
     frame = frame.iloc[worst.argsort(kind="stable")[::-1]].drop_duplicates(["problem", "dt", "stiffness"]).sort_index()
     frame = frame[frame["problem"] == frame.groupby("step", sort=False)["problem"].transform("first")]
-    grades, looks = graded(frame["error_share"], EDGES, "error {}".format, lambda end: f"{100 * end:g}%")
+    grades, looks = graded(
+        frame["error_share"].map(rounded), EDGES, "{} of the largest gradient".format, lambda end: f"{100 * end:g}%"
+    )
     frame["grade"] = frame["level"].where(frame["level"].isin(LOST), grades)
-    frame["cell"] = ["" if e != e else f"<{100 * min(EDGES):g}" if e < min(EDGES) else number(100 * e) if e < 10 else ">999"
-                     for e in frame["error_share"]]  # fmt: skip
+    is_small = (frame["level"] == "right") & (frame["verdict"] != "ok")
+    frame["cell"] = ["" if e != e else (f"<{100 * min(EDGES):g}" if e < min(EDGES) else number(100 * e) if e < 10 else ">999") + "*" * small
+                     for e, small in zip(frame["error_share"], is_small, strict=True)]  # fmt: skip
     found: list[Chart] = []
     for scene, part in frame.groupby("scene_name", sort=False):
-        right = (part["level"] == "right").groupby(part["step"]).transform("mean")
-        if part["contact"].nunique() > 1:
-            best = (
-                part.assign(right=right)
-                .sort_values("right", ascending=False, kind="stable")
-                .groupby("contact")["step"]
-                .first()
-            )
-            part = part[part["step"].isin(best)]
+        panel = "step" if part["contact"].nunique() > 1 else "integrator"
+        if panel == "step":
+            right = (part["level"] == "right").groupby(part["step"]).transform("mean")
+            best = part.loc[right.sort_values(ascending=False, kind="stable").index].drop_duplicates("contact")
+            part = part[part["step"].isin(best["step"])]
+        (name,) = short_names([f"{scene}, {part['variant'].max()}"], is_whole=True).values()
         found.append(Chart(
-            f"stability_map_{scene}" if found else "stability_map", part.assign(panel=part["step"] if part["contact"].nunique() > 1 else part["integrator"]),
-            [Column("dt_ms", "", "ms", label="time step")], [COMMON["stiffness"]], "grid", level="grade", styles=looks | LOST, panel="panel",
+            f"stability_map_{scene}" if found else "stability_map", part,
+            [Column("dt_ms", "", "ms", label="time step")], [COMMON["stiffness"]], "grid", level="grade", styles=looks | LOST, panel=panel,
             cell="cell", limit="stiffness_limit", limit_name=LIMIT, height=0.16,
-            subtitle=f"{scene}: error of the gradient in % of the largest gradient at any stiffness",
+            subtitle=f"{name}. Number: error of the gradient, in % of the largest gradient of the scene at any stiffness"
+                     + f". *: more than {100 * limit:g}% of the cell's own gradient, which is small" * any("*" in cell for cell in part["cell"]),
             text="The worst where backends disagree. Of several contact laws, each is drawn with the integrator that is most often right.",
         ))  # fmt: skip
     return found

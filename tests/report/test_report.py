@@ -20,6 +20,7 @@ from helpers import (
     BACKENDS,
     NAMES,
     STIFFNESS,
+    charts_of,
     experiment,
     failed,
     loaded,
@@ -156,14 +157,6 @@ def test_backends_that_agree_are_one_line():
 # ---------------------------------------------------------------------------------------------------------- charts
 
 
-def drawn(rows, swept, sweep=None, **given):
-    """The charts of rows that were swept along these axes, or by a sweep, by name."""
-    if sweep is None:
-        sweep = {name: sorted(map(float, rows[name].unique())) for name in swept}
-    made = experiment(sweep=sweep, **given)
-    return {chart.name: chart for chart in made.study.views(made, rows).charts}
-
-
 def figure_of(chart):
     with styled():
         return draw(chart)
@@ -175,15 +168,24 @@ def test_a_value_of_0_is_hollow_and_a_useless_one_a_number_that_stands_outside_i
     chart = Chart("one", frame, [Column("x", log=False)], [replace(RMSE, low="", high="", limit="")], series="name")
     (panel,) = figure_of(chart).axes
     hollow = [
-        list(line.get_ydata())
-        for line in panel.lines
-        if line.get_markerfacecolor() == "white" and len(line.get_ydata())
+        list(line.get_ydata()) for line in panel.lines if line.get_markerfacecolor() == "none" and len(line.get_ydata())
     ]
     assert hollow == [[FLOOR]]
+    assert np.isnan(panel.lines[0].get_ydata()[0])
     assert [text.get_text() for text in panel.texts] == ["1.0e4 ↑", "1.0e24 ↑"]
     boxes = [text.get_window_extent() for text in panel.texts]
     assert all(box.y0 >= panel.bbox.y1 for box in boxes)
     assert not boxes[0].overlaps(boxes[1])
+
+
+def test_an_interval_without_an_end_reaches_the_edge():
+    """A ratio without an upper end vanished with its row."""
+    frame = pd.DataFrame({"x": [2.0, 3.0, math.inf], "low": [0.0, 1.0, 2.0], "high": math.inf, "name": [*"abc"]})
+    column = Column("x", low="low", high="high", log=True)
+    (panel,) = figure_of(Chart("one", frame, [column], [text("name")], "dots")).axes
+    low, high = panel.get_xlim()
+    bars = panel.collections[0].get_segments()
+    assert [(start < low, end > high) for (start, _), (end, _) in bars] == [(True, True), (False, True), (False, True)]
 
 
 LIMITED = {"kind": "grid", "level": "level", "limit": "limit", "limit_name": "edge", "failed_name": "not run"}
@@ -217,24 +219,25 @@ def test_each_kind_of_mark_that_is_drawn_is_in_the_legend_and_no_other(values, c
 
 
 def test_beyond_a_named_value_the_chart_is_shaded():
-    plain = drawn(small_rows(), ["stiffness"])["bias_variance_stiffness"]
+    plain = charts_of(small_rows())["bias_variance_stiffness"]
     assert [(mark.name, mark.at, mark.to) for mark in plain.marks] == [("beyond the step size limit", 6400.0, math.inf)]
 
 
 def test_where_no_method_reaches_an_error_no_table_of_times_is_drawn():
     """It was an internal error after the run."""
     rows = table([row(samples=n, bias=1.0, bias_low=0.9, variance=4.0, time_s=1e-3) for n in (4, 16, 64)])
-    assert "speed_accuracy" not in drawn(rows, ["samples"])
+    assert "speed_accuracy" not in charts_of(rows, sweep={"samples": [4, 16, 64]})
 
 
 def test_nothing_swept_gives_a_table_of_estimators_and_problems():
     rows = table(
         [row(estimator=e, backend=b, scene=s) for e in NAMES for b in BACKENDS for s in ("pushing", "heaviside")]
     )
-    found = drawn(rows, ["sigma"], sweep={"sigma": [0.1]})
+    found = charts_of(rows, sweep={"sigma": [0.1]})
     assert set(found) == {"estimators", "speed_accuracy"}
     assert set(found["estimators"].frame["series"]) == set(NAMES)
     assert found["estimators"].kind == "grid"
+    assert found["estimators"].subtitle.startswith("relative RMSE at equal rollouts (")
 
 
 def test_a_parameter_in_an_identity_string_is_an_axis():
@@ -246,7 +249,7 @@ def test_a_parameter_in_an_identity_string_is_an_axis():
     found = views.rows_along(shown, named(shown, "ratio"))
     assert list(found["x"]) == [1.5, 3.0, 10.0]
     assert list(found["estimator_params"]) == ["", "", "delta=0.3"]
-    assert "bias_variance_ratio" in drawn(rows, ["ratio"], sweep=sweep)
+    assert "bias_variance_ratio" in charts_of(rows, sweep=sweep)
 
 
 def test_a_problem_is_named_by_every_parameter_that_differs_from_its_scenes_defaults():
@@ -269,7 +272,7 @@ def test_the_parameter_behind_smoothing_is_an_axis():
     sweep = {"union": [{"beta": [1.0, 10.0]}, {"kappa": [1e-6, 1e-4]}]}
     rows = [row(contact="softplus", smoothing=b) for b in (1.0, 10.0)]
     rows += [row(contact="complementarity", smoothing=k) for k in (1e-6, 1e-4)] + [row()]
-    figures = drawn(table(rows), ["beta", "kappa"], sweep=sweep)
+    figures = charts_of(table(rows), sweep=sweep)
     assert set(figures) == {"bias_variance_beta", "bias_variance_kappa"}
     assert set(figures["bias_variance_beta"].frame["contact"]) == {"softplus"}
 
@@ -278,7 +281,7 @@ def test_zipped_axes_do_not_split_problems_and_are_named_together():
     sweep = {"zip": {"stiffness": [1e2, 1e4], "dt": [0.01, 0.001]}}
     rows = table([row(stiffness=k, dt=h) for k, h in ((1e2, 0.01), (1e4, 0.001))])
     assert len(families(rows, "stiffness", sweep=sweep)) == 1
-    charts = drawn(rows, ["stiffness", "dt"], sweep=sweep)
+    charts = charts_of(rows, sweep=sweep)
     assert set(charts) == {"bias_variance_stiffness"}
     assert "dt" in charts["bias_variance_stiffness"].x[0].heading
     titles = [axis.title for axis in views.arrange(experiment(sweep=sweep), rows).axes]

@@ -176,6 +176,9 @@ def test_a_verdict_counts_scenes_and_not_problems(scenes, verdict):
              for kind, dose, updates in ((analysis.RANDOM, 0.3, 10.0), (analysis.RANDOM, 3.0, 20.0 + i))]  # fmt: skip
     line = compared(lines, "random error 3 / 0.3")
     assert (line["problems"], line["scenes"], line["above"], line["verdict"]) == (40, scenes, scenes, verdict)
+    assert len(views._ratios(line.to_frame().T.infer_objects().assign(comparison="")).frame) == 1, (
+        "an interval without an end is drawn too"
+    )
 
 
 def test_planted_errors_alone_have_a_report_that_compares_no_orders(run):

@@ -81,21 +81,22 @@ QUIET = np.full(5, 1e-3)
         (TIMES**3, "polynomial"),
         (np.sqrt(TIMES), "polynomial"),
         (np.exp(1.2 * TIMES), "exploding"),
-        (TIMES * np.exp(2.0 * TIMES), "exploding"),
         (np.exp(-TIMES), "vanishing"),
         (TIMES**-2, "vanishing"),
+        (TIMES[:4], "growing"),
         (np.ones(5), "open"),
         (np.array([1.0, 100.0, 1.0, 100.0, 1.0]), "open"),
     ],
 )
 def test_verdicts_of_planted_norms(norms, verdict):
-    assert fit(TIMES, norms, QUIET)["verdict"] == verdict
+    count = len(norms)
+    assert fit(TIMES[:count], norms, QUIET[:count])["verdict"] == verdict
 
 
 @pytest.mark.parametrize(
     ("horizons", "norms", "errors"),
     [
-        (TIMES[:4], np.exp(TIMES[:4]), QUIET[:4]),
+        (TIMES[:3], np.exp(TIMES[:3]), QUIET[:3]),
         (TIMES[:1], np.ones(1), QUIET[:1]),
         (np.ones(5), np.exp(TIMES), QUIET),  # equal horizons, such as seeds
         (TIMES, np.exp(0.3 * TIMES), 1e3 * QUIET),  # norms known within a factor of e

@@ -84,11 +84,9 @@ def _problems(table: pd.DataFrame) -> Table:
 
 
 def _ratios(pairs: pd.DataFrame) -> Chart:
-    """Return the ratios whose interval has an end: a row per comparison."""
-    frame = pairs[(pairs["ratio_low"] > 0) | np.isfinite(pairs["ratio_high"])]
-    frame = frame.assign(ratio_low=frame["ratio_low"].where(frame["ratio_low"] > 0), is_missed=np.isinf(frame["ratio"]))
+    """Return the ratios: a row per comparison, whose interval reaches the edge where it has no end."""
     return Chart(
-        "ratios", frame, [interval("ratio", label="times the updates, or rollouts between orders and samples", log=True)],
+        "ratios", pairs.assign(ratio=pairs["ratio"].where(pairs["ratio"] > 0), is_missed=np.isinf(pairs["ratio"])), [interval("ratio", label="times the updates, or rollouts between orders and samples", log=True)],
         [text("comparison", label="")], "dots", series="verdict", styles=VERDICTS, marks=[Mark("the same", 1.0)], failed="is_missed",
         failed_name="more than half of the scenes miss the target", height=0.24,
         subtitle=f"to 1/{MAIN:g} of the first regret, median over scenes; a single error is over the best gradient, a pair over its second",

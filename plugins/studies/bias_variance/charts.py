@@ -18,11 +18,10 @@ from bench.experiment.columns import Column, interval, text
 from bench.experiment.parameters import PROBLEM
 from bench.experiment.views import Chart, Mark, Style
 from bench.model import SURROGATE, registry
-from bench.report.colours import graded, method_styles
+from bench.report.colours import graded, method_styles, nested
 from bench.report.names import setting, short_names
 from bench.report.problems import ProblemRows, joined, problem_numbers, split_by_problem, titled
-from bench.report.style import MARKERS, colour
-from bench.report.text import axis_value, counted, number, short_duration
+from bench.report.text import axis_value, counted, number, rounded, short_duration, span
 from bench.report.views import (
     Arranged,
     attempted,
@@ -78,9 +77,7 @@ def charts(
         for i, axis in enumerate(order)
         if not any(axis.column in other.moves for other in order[:i])  # axes that step together have one chart
     ]
-    along = [_contrast(labelled, subtitle), *along]
-    if not swept and is_timed:
-        along += [_error_and_time(labelled, subtitle)]
+    along = [_error_and_time(labelled, subtitle), *along]
     is_grid = (methods[["setting", "estimator"]].nunique() > 1).all()
     if max(swept.values(), default=0) < LEAST and is_grid:
         along = [_estimators(methods), *along]
@@ -120,13 +117,12 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
 def _conditions(shown: Arranged) -> str:
     """Return what all panels share: samples, medians over seeds, surrogate gradients."""
     rows = shown.rows
-    parts = [*short_names(rows["scene"]).values()] if rows["scene"].nunique() == 1 else []
-    parts += [f"{n:g} samples" for n in rows["samples"].unique()] if rows["samples"].nunique() == 1 else []
-    seeds = rows["seed"].nunique()
-    parts += [f"medians over {seeds} seeds"] if seeds > 1 else []
-    for law in rows.loc[rows["reason"].str.contains(SURROGATE, regex=False), "contact"].unique():
-        parts.append(f"{law}: {SURROGATE}")
-    return ", ".join(parts)
+    scenes, samples, seeds = (rows[name].unique() for name in ("scene", "samples", "seed"))
+    laws = rows.loc[rows["reason"].str.contains(SURROGATE, regex=False), "contact"].unique()
+    return ", ".join([
+        *[*short_names(scenes).values()] * (len(scenes) == 1), *[f"{samples[0]:g} samples"] * (len(samples) == 1),
+        *[f"medians over {len(seeds)} seeds"] * (len(seeds) > 1), *(f"{law}: {SURROGATE}" for law in laws),
+    ])  # fmt: skip
 
 
 # ---------------------------------------------------------------------------------------------- along an axis
@@ -162,7 +158,7 @@ def _along(
         f"{stem}_" + re.sub(r"\W", "_", axis.column), frame, [Column("x", label=axis.title, format="setting")], y, series="series",
         title=f"How does the {what} of one estimate depend on {axis.column.replace('_', ' ')}?",
         panel="panel", marks=marks, failed="failed", across=len(names) if compared else len(drawn),
-        height=2.7 if len(drawn) <= 2 else 2.1, styles=_nested(frame["series"].unique() if compared else ()),
+        height=2.7 if len(drawn) <= 2 else 2.1, styles=_looks(frame["series"].unique() if compared else ()),
         subtitle=", ".join(filter(None, [subtitle, *notes, *shares])),
     )  # fmt: skip
 
@@ -176,20 +172,24 @@ def _lines(problem: ProblemRows, compared: str, names: Sequence[str]) -> pd.Data
     if compared:
         others = joined({name: value for name, value in problem.identity.items() if name != compared})
         curves = curves[[bool({name, name.partition("[")[0]} & {*names}) for name in curves[compared]]]
+        # a law has its own backends, which decide its times
+        backends = " on " + curves["backend"] if compared == "contact" else ""
         return curves.assign(
-            series=curves[compared], panel=[", ".join(filter(None, (others, label))) for label in curves["label"]]
+            series=curves[compared] + backends,
+            panel=[", ".join(filter(None, (others, label))) for label in curves["label"]],
         )
     # those that differ from the first are named after their backends
     first = curves["curve"] == curves.groupby("label")["curve"].transform("min")
     return curves.assign(series=curves["label"].where(first, curves["method"]), panel=problem.title())
 
 
-def _nested(names: Sequence[str]) -> dict[str, Style]:
-    """Return looks of backends or contact laws in which lines on top of each other are all seen: each later one is thinner."""
-    return {
-        name: Style(colour(i), MARKERS[i % len(MARKERS)], width=1.2 * (len(names) - i), meaning=": ".join(filter(None, (short, _summary(name)))))
-        for i, (name, short) in enumerate(short_names(names).items())
-    }  # fmt: skip
+def _looks(names: Sequence[str]) -> dict[str, Style]:
+    """Return nested looks of backends, or of contact laws with what they are."""
+    meanings = {
+        name: ": ".join(filter(None, (short, _summary(name.partition(" on ")[0]))))
+        for name, short in short_names(names).items()
+    }
+    return {name: replace(look, meaning=meanings[name]) for name, look in nested(names).items()}
 
 
 def choose_problems(problems: Sequence[ProblemRows]) -> tuple[list[ProblemRows], list[str]]:
@@ -199,9 +199,9 @@ def choose_problems(problems: Sequence[ProblemRows]) -> tuple[list[ProblemRows],
     """
     first: dict[str, ProblemRows] = {}
     for problem in problems if len(problems) > 2 else ():
-        first.setdefault(joined({k: v for k, v in problem.identity.items() if isinstance(v, str)}), problem)
+        first.setdefault(problem.parts()[0], problem)
     chosen = list(first.values())[:PANELS] or list(problems)
-    numbers = {k: v for p in chosen for k, v in p.identity.items() if not isinstance(v, str)}
+    numbers = {name: value for problem in chosen for name, value in problem.parts()[1].items()}
     held = ", ".join(setting(name, f"{value:g}") for name, value in numbers.items())
     shares = f"{len(chosen)} of {counted(len(problems), 'problem')}" + f" ({held})" * bool(held)
     return chosen, [shares] * (len(chosen) < len(problems))
@@ -210,10 +210,10 @@ def choose_problems(problems: Sequence[ProblemRows]) -> tuple[list[ProblemRows],
 # ----------------------------------------------------------------------------------------------- error and cost
 
 
-def _contrast(shown: Arranged, subtitle: str) -> Chart | None:
-    """Return error against time at two values of an axis, joined by arrows, as the experiment's ``compares`` names them.
+def _error_and_time(shown: Arranged, subtitle: str) -> Chart | None:
+    """Return error against time: a point is an estimator on its fastest backend, a panel a scene with a contact law.
 
-    A point is an estimator on its fastest backend, a panel a scene with a contact law, with the costs of the same rollouts below.
+    Two values of an axis that the experiment's ``compares`` names are joined by arrows, with the costs of the same rollouts below.
     """
     program = problem_numbers(shown.rows, PROBLEM)
     # cells of one program have the same costs, and those that use costs store them
@@ -227,22 +227,29 @@ def _contrast(shown: Arranged, subtitle: str) -> Chart | None:
             raise unknown("axis in compares", name, (*shown.numbers, "estimators", "backends", "contacts"))
         rows = rows[rows[column].isin(values)]
         along, ends = (axis, list(values)) if len(values) == 2 and axis else (along, ends)
-    if rows.empty or along is None:
+    if rows.empty or (along is None and shown.swept()):
         return None
-    frame = pd.concat([_on_fastest(part) for _, part in rows.groupby(["series", "panel"], sort=False)])
+    pair = ["series", "panel"]
+    times = rows.groupby([*pair, "backend", "dtype"])[TIME].transform("median")
+    frame = rows[times == times.groupby([rows[name] for name in pair]).transform("min")]
+    looks = method_styles(frame["series"].unique())
+    chart = Chart(
+        "speed_accuracy", frame, [SECONDS], [RMSE], "points", series="series", panel="panel", across=2, height=2.2, own_scales=True,
+        title="What error has one estimate, and what time does it take?", subtitle=", ".join(filter(None, [subtitle, FASTEST])),
+        panel_notes={panel: _summary(law) for panel, law in zip(frame["panel"], frame["contact"], strict=True)},
+        styles={name: replace(look, meaning=f"{short_names(looks, is_whole=True)[name]}: {_family(name.partition('[')[0])}") for name, look in looks.items()},
+    )  # fmt: skip
+    if along is None:
+        return chart
     frame = frame.sort_values(along.column, key=lambda at: at == ends[-1], kind="stable")
-    pairs = frame.groupby(["series", "panel"])
+    pairs = frame.groupby(pair)
     # one program at both settings: what differs is noise
     frame = frame.assign(**{TIME: pairs[TIME].transform("median")}, arrow=frame["series"] + ", " + frame["panel"])
     moved = ((pairs["cost"].max() - pairs["cost"].min()) / pairs["cost"].mean().abs()).max()
     below = replace(COST, doc=f"costs of the same rollouts, changed by at most {number(100 * moved)}%")
-    looks = method_styles(frame["series"].unique())
-    return Chart(
-        "contrast", frame, [SECONDS], [replace(RMSE, low="", high=""), *[below] * bool(moved == moved)], "points", series="series",
-        panel="panel", arrow="arrow", arrow_name=f"{along.column} {' to '.join(f'{end:,g}' for end in ends)} {along.unit}".rstrip(),
-        across=2, height=2.2, own_scales=True, subtitle=", ".join(filter(None, [subtitle, FASTEST])),
-        panel_notes={panel: _summary(law) for panel, law in zip(frame["panel"], frame["contact"], strict=True)},
-        styles={name: replace(look, meaning=f"{short_names(looks, is_whole=True)[name]}: {_family(name.partition('[')[0])}") for name, look in looks.items()},
+    return replace(
+        chart, name="contrast", frame=frame, y=[replace(RMSE, low="", high=""), *[below] * bool(moved == moved)], arrow="arrow",
+        arrow_name=f"{along.column} {' to '.join(f'{end:,g}' for end in ends)} {along.unit}".rstrip(),
     )  # fmt: skip
 
 
@@ -253,36 +260,19 @@ def _summary(contact: str) -> str:
     return re.split("[:.]", doc)[0].lower()
 
 
-def _on_fastest(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return an estimator's rows on its fastest backend, by the median over its settings."""
-    times = rows.groupby(["backend", "dtype"])[TIME].transform("median")
-    return rows[times == times.min()]
-
-
-def _error_and_time(shown: Arranged, subtitle: str) -> Chart | None:
-    """Return error against time where nothing was swept: a point per estimator on its fastest backend, a panel per problem."""
-    rows = with_known(shown.rows.assign(panel=titled(shown.rows, ["scene", "contact"])), TIME)
-    if rows.empty:
-        return None
-    frame = pd.concat([_on_fastest(part) for _, part in rows.groupby(["series", "panel"], sort=False)])
-    return Chart(
-        "speed_accuracy", frame, [SECONDS], [RMSE], "points", series="series", panel="panel", across=3, height=1.9,
-        title="What error has one estimate, and what time does it take?",
-        subtitle=", ".join(filter(None, [subtitle, FASTEST])),
-    )  # fmt: skip
-
-
 def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Chart | None:
     """Return the time of each estimator to reach an error, as a table whose colours are its factor to the first of each problem.
 
-    Where backends are compared, each has a panel; else an estimator is on its fastest.
+    Problems that differ in numbers only, such as the descent, are in panels of their own. Where backends are compared, each has
+    a panel; else an estimator is on its fastest.
     """
     if best.empty:
         return None
     target, backends = TARGETS[0], shown.experiment.compares.get("backends", ())
     lead = best[(best["by"] == "time") & (best["relative error"] == target)].set_index("problem")
     lines: list[dict[str, Any]] = [
-        {"problem": problem.title(), "series": name.partition(" on ")[0], "backend": name.partition(" on ")[2], "cost": needed.cost,
+        {"title": problem.title(), "problem": problem.parts()[0], "panel": joined(problem.parts()[1]),
+         "series": name.partition(" on ")[0], "backend": name.partition(" on ")[2], "cost": needed.cost,
          "sign": "<" * (needed.how == "at once"), "leads": name in (lead["fastest"][problem.title()], *lead["tied"][problem.title()])}
         for problem in split_by_problem(shown, SAMPLES, ("scene",)) if problem.title() in lead.index
         for name, needed in methods_by_cost(problem, target, TIME).items()
@@ -290,13 +280,15 @@ def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Cha
     if not any(np.isfinite(line["cost"]) for line in lines):
         return None
     frame = pd.DataFrame(lines).sort_values("cost")
-    frame = frame.drop_duplicates(["problem", "series", *["backend"] * bool(backends)]).sort_index()
+    frame = frame.drop_duplicates(["title", "series", *["backend"] * bool(backends)]).sort_index()
     frame = frame[frame["backend"].isin(backends or frame["backend"]) & np.isfinite(frame["cost"])]
-    factor = frame["cost"] / frame.groupby("problem")["cost"].transform("min")
+    factor = frame["cost"] / frame.groupby("title")["cost"].transform("min")
+    if backends:
+        frame["panel"] = (frame["backend"] + ", " + frame["panel"]).str.removesuffix(", ")
     grades, looks = graded(factor, BEHIND, "{} times the first".format, "{:g}".format)
     return Chart(
         "speed_accuracy", frame.assign(grade=grades.mask(frame["leads"], FIRST), cell=frame["sign"] + frame["cost"].map(short_duration)),
-        [text("problem", label="")], [ESTIMATOR], "grid", panel="backend" if backends else "", level="grade", cell="cell", across=1,
+        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", level="grade", cell="cell", across=1,
         height=0.2, styles={FIRST: Style(GRADES[0.1])} | looks, failed_name="not known to be reached",
         title=f"Which method reaches an error of {target:.0%} first?",
         subtitle=", ".join(filter(None, [f"time to a relative error of {target:.0%}", subtitle, "" if backends else FASTEST])),
@@ -318,14 +310,16 @@ def _estimators(methods: pd.DataFrame) -> Chart:
     axis, at = frame[["axis", "at"]].iloc[0]
     error, known = frame["error"], np.isfinite(frame["error"])
     marks = frame["status"].where(frame["verdict"] == NO_RESULT, "").mask(frame["verdict"] == FAILS, " fails")
-    grades, looks = graded(error, GRADES, "error {}".format, "{:g}".format)
+    at_equal = f"{axis} {axis_value(at)}" if axis not in ("", "rollouts") else ""
+    spent = f"at equal rollouts ({span(methods['rollouts'].min(), methods['rollouts'].max(), 3)})"
+    grades, looks = graded(error.map(rounded), GRADES, "error {}".format, "{:g}".format)
     return Chart(
         "estimators",
         frame.assign(panel=frame["estimator"].map(families), series=frame["estimator"], grade=grades.where(known, "no result"),
                      cell=(frame["error_is_limit"].map({True: "<"}).fillna("") + error.map(number)).where(known, marks)),
         [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", level="grade", styles=looks | {"no result": NOTHING},
         cell="cell", across=1, height=0.2, title="Where does each estimator win, and where does it fail?", failed_name="cannot be used",
-        subtitle=f"relative RMSE of one estimate{f', {axis} {axis_value(at)}' if axis else ''}, sorted by the worst case; from 1 on the zero estimate is better",
+        subtitle=", ".join(filter(None, [f"relative RMSE {spent}", at_equal, "sorted by the worst case; from 1 on the zero estimate is better"])),
     )  # fmt: skip
 
 

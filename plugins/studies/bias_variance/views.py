@@ -266,8 +266,6 @@ def _values(axis: str, at: pd.Series) -> str:
 
 def _errors(methods: pd.DataFrame) -> str:
     """Return the smallest and largest error; ``< 0.12`` if some are upper limits, ``-`` without any."""
-    if methods.empty:
-        return "-"
     known = span(*methods["error"].agg(["min", "max"]))
     return f"< {number(methods['error'].max())}" if methods["error_is_limit"].any() else known
 

@@ -17,9 +17,9 @@ from bench.experiment.parameters import named
 from bench.experiment.views import Chart, Table, Views
 from bench.host.parameters import remember
 from bench.measure import performance
+from bench.measure.statistics import ends
 from bench.report.colours import method_styles
 from bench.report.problems import problem_names, titled
-from bench.report.text import axis_value
 from bench.report.views import arrange, attempted, estimator_labels
 
 from .. import PARTS
@@ -116,9 +116,11 @@ def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
     shown = arrange(experiment, rows)
     runs = attempted(shown.rows)
     runs = runs[np.isfinite(runs["start_cost"])]
-    tuned_axes = tuple(axis for axis in shown.axes if _is_tuned(axis, runs))
+    tuned_axes = [axis for axis in shown.axes if _is_tuned(axis, runs)]
     names = problem_names(shown, PARTS, tuned_axes, rows=runs).astype(str)
-    runs = runs.assign(problem=names, estimator_label=estimator_labels(runs), tuning=_tuning_labels(runs, tuned_axes))
+    short = {axis.column: axis.short for axis in tuned_axes}
+    tuning = titled(runs[[*short]].rename(columns=short), [*short.values()])
+    runs = runs.assign(problem=names, estimator_label=estimator_labels(runs), tuning=tuning)
     runs = runs.assign(method=titled(runs, ["estimator_label", "optimizer"]))
     best_known, status = _best_known_cost(runs)
     start, final = runs["start_cost"], runs["final_cost"]
@@ -132,16 +134,6 @@ def _is_tuned(axis: Axis, rows: pd.DataFrame) -> bool:
     """Return whether an axis sweeps a parameter of an optimizer."""
     found = named(rows, axis.names)
     return bool(found[[place for place in found if place[0] == "optimizer"]].notna().any(axis=None))
-
-
-def _tuning_labels(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.Series:
-    labels = [
-        ", ".join(
-            f"{axis.short}={axis_value(value)}" for axis, value in zip(axes, values, strict=True) if value == value
-        )
-        for values in rows[[axis.column for axis in axes]].to_numpy(float)
-    ]
-    return pd.Series(labels, index=rows.index, dtype=object)
 
 
 def _best_known_cost(rows: pd.DataFrame) -> tuple[pd.Series, pd.Series]:
@@ -182,13 +174,10 @@ def times_to_targets(runs: RunSet) -> pd.DataFrame:
     lines = []
     for (problem, method, target), part in hits(runs).groupby(["problem", "method", "target"], sort=False):
         costs, reached = part["spent"].to_numpy(), part["reached"].to_numpy()
-        low, high = performance.wilson(int(reached.sum()), len(reached))
-        art_low, art_high = performance.runtime_interval(costs, reached)
         lines.append({
             "problem": problem, "method": method, "tuning": runs.best_tunings[problem, method], "target": target,
-            "successes": int(reached.sum()), "searches": len(reached), "rate": float(reached.mean()),
-            "rate_low": low, "rate_high": high, "art": performance.average_runtime(costs, reached),
-            "art_low": art_low, "art_high": art_high,
+            "successes": int(reached.sum()), "searches": len(reached), **ends("rate", (float(reached.mean()), *performance.wilson(int(reached.sum()), len(reached)))),
+            **ends("art", (performance.average_runtime(costs, reached), *performance.runtime_interval(costs, reached))),
         })  # fmt: skip
     return pd.DataFrame(lines)
 
@@ -225,18 +214,15 @@ def summarise(runs: RunSet) -> pd.DataFrame:
     better = improvement(runs)
     tied = first_or_tied(runs)
     for method, part in runs.best_runs.groupby("method", sort=False):
-        strata = [own.to_numpy() for _, own in part["score"].dropna().groupby(part["problem"], sort=False)]
-        low, high = _score_interval(runs, part.dropna(subset="score"), strata)
         own = reached[reached["method"] == method]
         share, error = share_of_targets(own)
-        ends = over_scenes(runs, own.groupby("problem")["rate"].mean(), share - error, share + error)
+        low, high = over_scenes(runs, own.groupby("problem")["rate"].mean(), share - error, share + error)
         cells = runs.rows[runs.rows["method"] == method]
         lines.append({
             "method": method, "problems": part["problem"].nunique(), "searches": len(part),
-            "reached": share, "reached_low": max(0.0, ends[0]), "reached_high": min(1.0, ends[1]),
+            **ends("reached", (share, max(0.0, low), min(1.0, high))),
             "verdict": "first or tied" if method in tied else "",
-            "score": _pooled_score(strata), "score_low": low, "score_high": high,
-            **better.loc[method], "profile": profiles[method], "diverged": int((part["status"] == "diverged").sum()),
+            **ends("score", _score(runs, part.dropna(subset="score"))), **better.loc[method], "profile": profiles[method], "diverged": int((part["status"] == "diverged").sum()),
             "tunings": int(cells["tuning"].nunique()), "median_score": float(cells["score"].median()),
         })  # fmt: skip
     return pd.DataFrame(lines)
@@ -254,19 +240,15 @@ def improvement(runs: RunSet) -> pd.DataFrame:
     base = next((m for m in methods if m.partition(",")[0].partition("[")[0] == "fobg"), None)
     lines = {}
     for method in methods:
-        lines[method] = (math.nan, math.nan, math.nan)
+        found = (math.nan, math.nan, math.nan)
         if base not in (None, method) and len(pairs := wide[[method, base]].dropna()):
             wins = (pairs[method] < pairs[base]) + 0.5 * (pairs[method] == pairs[base])
             by_problem = wins.groupby(level="problem").mean()
             share = float(by_problem.mean())
             low, high = over_scenes(runs, by_problem, *performance.wilson(round(share * len(pairs)), len(pairs)))
-            lines[method] = (share, max(0.0, low), min(1.0, high))
-    columns = ["improvement", "improvement_low", "improvement_high"]
-    return pd.DataFrame.from_dict(lines, orient="index", columns=columns)
-
-
-def _pooled_score(strata: Sequence[np.ndarray]) -> float:
-    return performance.interquartile_mean(np.concatenate(strata)) if strata else math.nan
+            found = (share, max(0.0, low), min(1.0, high))
+        lines[method] = ends("improvement", found)
+    return pd.DataFrame.from_dict(lines, orient="index")
 
 
 def first_or_tied(runs: RunSet) -> set[str]:
@@ -287,13 +269,22 @@ def first_or_tied(runs: RunSet) -> set[str]:
     return tied
 
 
-def _score_interval(runs: RunSet, part: pd.DataFrame, strata: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Return the bootstrap interval of the pooled score: over scenes, or for one scene over the searches of each problem."""
-    by_scene = [own.to_numpy() for _, own in part.groupby(part["problem"].map(runs.scenes), sort=False)["score"]]
+def _score(runs: RunSet, part: pd.DataFrame) -> tuple[float, float, float]:
+    """Return the interquartile mean of the scores with its bootstrap interval: over scenes, or for one over the searches of each problem."""
+
+    def pooled(drawn: Sequence[np.ndarray]) -> float:
+        return performance.interquartile_mean(np.concatenate(drawn))
+
+    strata, by_scene = (
+        [own.to_numpy() for _, own in part.groupby(names, sort=False)["score"]]
+        for names in (part["problem"], part["problem"].map(runs.scenes))
+    )
+    if not strata:
+        return (math.nan,) * 3
     if len(by_scene) < 2:
-        return performance.bootstrap(strata, _pooled_score) if strata else (math.nan, math.nan)
+        return pooled(strata), *performance.bootstrap(strata, pooled)
     places = np.arange(len(by_scene))
-    return performance.bootstrap([places], lambda drawn: _pooled_score([by_scene[i] for i in drawn[0]]))
+    return pooled(strata), *performance.bootstrap([places], lambda drawn: pooled([by_scene[i] for i in drawn[0]]))
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
