@@ -33,10 +33,9 @@ def looks_by_name(charts: Sequence[Chart]) -> dict[str, Style]:
     return {name: style for name, style in found.items() if name in drawn}
 
 
-def nested(names: Iterable[str]) -> dict[str, Style]:
+def nested(names: Sequence[str]) -> dict[str, Style]:
     """Return looks in which lines and points on top of each other are all seen: each later one is thinner and smaller."""
-    every = [*names]
-    return {name: replace(_look(i), width=1.2 * (len(every) - i)) for i, name in enumerate(every)}
+    return {name: replace(_look(i), width=1.2 * (len(names) - i)) for i, name in enumerate(names)}
 
 
 def _look(place: int) -> Style:

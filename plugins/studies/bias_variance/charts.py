@@ -21,7 +21,7 @@ from bench.model import SURROGATE, registry
 from bench.report.colours import graded, method_styles, nested
 from bench.report.names import setting, short_names
 from bench.report.problems import ProblemRows, joined, problem_numbers, split_by_problem, titled
-from bench.report.text import axis_value, counted, number, rounded, short_duration, span
+from bench.report.text import axis_value, counted, number, rounded, short_duration
 from bench.report.views import (
     Arranged,
     attempted,
@@ -33,7 +33,7 @@ from bench.report.writer import LEAST
 
 from .columns import COLUMNS
 from .comparisons import FAILS, NO_RESULT
-from .time_to_accuracy import ROLLOUTS, SAMPLES, TARGETS, TIME, with_known
+from .time_to_accuracy import SAMPLES, TARGETS, TIME, with_known
 from .time_to_accuracy import methods as methods_by_cost
 
 FLOOR = 1e-4
@@ -42,7 +42,7 @@ GRADES = {0.1: "#08519c", 0.3: "#6baed6", 1.0: "#d6e6f4", 10.0: "#fdae61", math.
 """Upper ends of the grades of an error, and their colours."""
 BEHIND = {3.0: "#6baed6", 10.0: "#d6e6f4", math.inf: "#fdae61"}
 """Upper ends of the grades of a factor to the first method, and their colours."""
-FIRST, NOTHING = "first, or tied with it", Style("#f2f2f2")
+FIRST = "first, or tied with it"
 PANELS = 4
 """Most problems of a chart along an axis."""
 RMSE = Column(
@@ -102,7 +102,6 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
         "bias_shown": rows["bias"].where(~limit, rows["bias_high"]) / norm,
         "bias_from": rows["bias_low"] / norm,
         "bias_to": rows["bias_high"] / norm,
-        ROLLOUTS: rows[ROLLOUTS],
     }
     good = rows["status"] == "ok"
     return rows.assign(
@@ -144,7 +143,7 @@ def _along(
     series = compares.get(f"{compared}s", ())
     frame = pd.concat([_lines(problem, compared, series) for problem in problems], ignore_index=True)
     # most estimators of a chart along an axis, where the experiment does not name them
-    names = compares.get("estimators") or list(dict.fromkeys(frame["label"]))[:6]
+    names = compares.get("estimators") or [*frame["label"].unique()[:6]]
     total = frame["label"].nunique()
     shares = [f"{len(names)} of {total} estimators"] * (len(names) < total)
     for column, kept in (("label", names), ("problem", [problem.title() for problem in drawn])):
@@ -170,13 +169,13 @@ def _lines(problem: ProblemRows, compared: str, names: Sequence[str]) -> pd.Data
     """
     curves = estimator_curves(problem.rows, None if compared == "backend" else 0.03).assign(problem=problem.title())
     if compared:
-        others = joined({name: value for name, value in problem.identity.items() if name != compared})
+        others = joined({**problem.identity, compared: ""})
         curves = curves[[bool({name, name.partition("[")[0]} & {*names}) for name in curves[compared]]]
         # a law has its own backends, which decide its times
         backends = " on " + curves["backend"] if compared == "contact" else ""
         return curves.assign(
             series=curves[compared] + backends,
-            panel=[", ".join(filter(None, (others, label))) for label in curves["label"]],
+            panel=[joined({"": others, "label": label}) for label in curves["label"]],
         )
     # those that differ from the first are named after their backends
     first = curves["curve"] == curves.groupby("label")["curve"].transform("min")
@@ -185,11 +184,11 @@ def _lines(problem: ProblemRows, compared: str, names: Sequence[str]) -> pd.Data
 
 def _looks(names: Sequence[str]) -> dict[str, Style]:
     """Return nested looks of backends, or of contact laws with what they are."""
-    meanings = {
-        name: ": ".join(filter(None, (short, _summary(name.partition(" on ")[0]))))
-        for name, short in short_names(names).items()
+    short = short_names(names)
+    return {
+        name: replace(look, meaning=": ".join(filter(None, (short[name], _summary(name.partition(" on ")[0])))))
+        for name, look in nested(names).items()
     }
-    return {name: replace(look, meaning=meanings[name]) for name, look in nested(names).items()}
 
 
 def choose_problems(problems: Sequence[ProblemRows]) -> tuple[list[ProblemRows], list[str]]:
@@ -201,7 +200,7 @@ def choose_problems(problems: Sequence[ProblemRows]) -> tuple[list[ProblemRows],
     for problem in problems if len(problems) > 2 else ():
         first.setdefault(problem.parts()[0], problem)
     chosen = list(first.values())[:PANELS] or list(problems)
-    numbers = {name: value for problem in chosen for name, value in problem.parts()[1].items()}
+    numbers = dict(item for problem in chosen for item in problem.parts()[1].items())
     held = ", ".join(setting(name, f"{value:g}") for name, value in numbers.items())
     shares = f"{len(chosen)} of {counted(len(problems), 'problem')}" + f" ({held})" * bool(held)
     return chosen, [shares] * (len(chosen) < len(problems))
@@ -263,7 +262,7 @@ def _summary(contact: str) -> str:
 def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Chart | None:
     """Return the time of each estimator to reach an error, as a table whose colours are its factor to the first of each problem.
 
-    Problems that differ in numbers only, such as the descent, are in panels of their own. Where backends are compared, each has
+    Problems that differ in numbers only, as in the descent, are in panels of their own. Where backends are compared, each has
     a panel; else an estimator is on its fastest.
     """
     if best.empty:
@@ -283,8 +282,8 @@ def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Cha
     frame = frame.drop_duplicates(["title", "series", *["backend"] * bool(backends)]).sort_index()
     frame = frame[frame["backend"].isin(backends or frame["backend"]) & np.isfinite(frame["cost"])]
     factor = frame["cost"] / frame.groupby("title")["cost"].transform("min")
-    if backends:
-        frame["panel"] = (frame["backend"] + ", " + frame["panel"]).str.removesuffix(", ")
+    differs = bool(frame.groupby("problem")["title"].nunique().max() > 1)
+    frame["panel"] = titled(frame, ["backend"] * bool(backends) + ["panel"] * differs)
     grades, looks = graded(factor, BEHIND, "{} times the first".format, "{:g}".format)
     return Chart(
         "speed_accuracy", frame.assign(grade=grades.mask(frame["leads"], FIRST), cell=frame["sign"] + frame["cost"].map(short_duration)),
@@ -311,15 +310,15 @@ def _estimators(methods: pd.DataFrame) -> Chart:
     error, known = frame["error"], np.isfinite(frame["error"])
     marks = frame["status"].where(frame["verdict"] == NO_RESULT, "").mask(frame["verdict"] == FAILS, " fails")
     at_equal = f"{axis} {axis_value(at)}" if axis not in ("", "rollouts") else ""
-    spent = f"at equal rollouts ({span(methods['rollouts'].min(), methods['rollouts'].max(), 3)})"
+    spent = " to ".join(dict.fromkeys(map(axis_value, methods["rollouts"].agg(["min", "max"]).round())))
     grades, looks = graded(error.map(rounded), GRADES, "error {}".format, "{:g}".format)
     return Chart(
         "estimators",
         frame.assign(panel=frame["estimator"].map(families), series=frame["estimator"], grade=grades.where(known, "no result"),
                      cell=(frame["error_is_limit"].map({True: "<"}).fillna("") + error.map(number)).where(known, marks)),
-        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", level="grade", styles=looks | {"no result": NOTHING},
+        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", level="grade", styles=looks | {"no result": Style("#f2f2f2")},
         cell="cell", across=1, height=0.2, title="Where does each estimator win, and where does it fail?", failed_name="cannot be used",
-        subtitle=", ".join(filter(None, [f"relative RMSE {spent}", at_equal, "sorted by the worst case; from 1 on the zero estimate is better"])),
+        subtitle=", ".join(filter(None, [f"relative RMSE at equal rollouts ({spent})", at_equal, "sorted by the worst case; from 1 on the zero estimate is better"])),
     )  # fmt: skip
 
 
