@@ -111,15 +111,17 @@ def clustered_error(values: np.ndarray, clusters: np.ndarray) -> float:
     return float(stdtrit(count - 1, 0.975)) * error
 
 
-def interquartile_mean(values: np.ndarray) -> float:
-    """Return the mean of the middle half of the values. A value at the edge of that half is weighted by its share in it.
+def interquartile_mean(values: np.ndarray) -> Any:
+    """Return the mean of the middle half of the values along the first axis; NaN without values.
 
-    >>> interquartile_mean(np.array([0.0, 1.0, 2.0, 9.0]))
+    A value at the edge of that half is weighted by its share in it.
+
+    >>> float(interquartile_mean(np.array([0.0, 1.0, 2.0, 9.0])))
     1.5
     """
-    ordered, n = np.sort(np.ravel(values)), np.size(values)
+    n = len(values)
     if not n:
-        return math.nan
+        return np.full(values.shape[1:], math.nan)[()]
     edges = np.arange(n + 1) / n
     inside = np.clip(np.minimum(edges[1:], 0.75) - np.maximum(edges[:-1], 0.25), 0.0, None)
-    return float(ordered @ inside / inside.sum())
+    return np.sort(values, axis=0).T @ inside / inside.sum()

@@ -39,7 +39,7 @@ NAMESPACE = SimpleNamespace(**vars(np) | {"stack": _stack})
 class NumpyProblem(Problem):
     """A program run by NumPy."""
 
-    block = 1 << 13
+    block = 1 << 14
 
     def __init__(self, program: Program, dtype: str, step: float) -> None:
         super().__init__(program)

@@ -35,7 +35,7 @@ class TorchOps(LoopOps):
 class TorchProblem(Problem):
     """A program run by torch."""
 
-    block = 1 << 13
+    block = 1 << 14
 
     def __init__(self, program: Program, dtype: str) -> None:
         import torch

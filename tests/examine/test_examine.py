@@ -457,13 +457,15 @@ def test_the_advice_compares_the_gradient_without_noise_and_mirrored_draws():
 def test_noise_may_be_a_key_of_jax():
     jax = pytest.importorskip("jax")
 
+    @jax.jit
     def cost(x, key):
         return (x[0] + 0.1 * jax.random.normal(key)) ** 2
 
+    @jax.jit
     def slope(x, key):
         return 1.5 * jax.grad(cost)(x, key)
 
-    given = {"noise": "key", "sigma": 0.1, "calls": 4000, "progress": False}
+    given = {"noise": "key", "sigma": 0.1, "calls": 1000, "progress": False}
     report = bench.examine(cost, [1.0], grad="jax", **given)
     assert (report.derivative, report.use) == ("right", "usable"), str(report)
     assert bench.examine(cost, [1.0], grad=slope, **given).status == 1

@@ -228,12 +228,8 @@ def middle_with_interval(name: str, values: np.ndarray) -> dict[str, Any]:
     """Return interquartile means over the first axis and their bootstrap intervals by column, of fewer than :data:`MIN_SEEDS` NaN."""
     low = high = np.full(values.shape[1:], math.nan)[()]
     if len(values) >= MIN_SEEDS:
-        low, high = bootstrap([values], _middle)
-    return ends(name, (_middle([values]), low, high))
-
-
-def _middle(drawn: Sequence[np.ndarray]) -> Any:
-    return np.apply_along_axis(interquartile_mean, 0, drawn[0])[()]
+        low, high = bootstrap([values], lambda drawn: interquartile_mean(drawn[0]))
+    return ends(name, (interquartile_mean(values), low, high))
 
 
 def curves_of(runs: pd.DataFrame) -> pd.DataFrame:
