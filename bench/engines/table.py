@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -18,7 +19,7 @@ import pandas as pd
 from bench.engines import environments
 from bench.engines.backend import EngineBackend
 from bench.engines.conformance import runner
-from bench.errors import printable
+from bench.errors import UserError, printable
 from bench.model import registry
 
 COLUMNS = ("engine", "versions", *runner.COLUMNS, "command")
@@ -32,7 +33,9 @@ class Engine:
     """A backend's engine: ``NAME``, or ``NAME==VERSION`` in an environment of another release."""
 
     def __init__(self, word: str) -> None:
-        self.word, (self.name, _, self.release) = word, word.partition("==")
+        self.word, (self.name, sign, self.release) = word, word.partition("==")
+        if sign and not self.release:
+            raise UserError(f"engine {word} has no release: write {word}VERSION or {word}newest")
         entry = registry.find("backends", self.name)
         self.plugin: Any = entry.plugin
         self.is_outside = self.plugin is not None and issubclass(self.plugin, EngineBackend)
@@ -47,8 +50,9 @@ class Engine:
 
     def file(self, end: str) -> Path:
         """Return the file ``NAME`` + ``end`` in the folder ``engines`` of the backend's engine, which may not exist."""
-        here = Path(inspect.getfile(self.plugin)).parents[1] / "engines"
-        return (self.plugin.files()[0].parent if self.is_outside else here) / f"{self.name}{end}"
+        plugin: Any = registry.usable("backends", self.name)
+        here = Path(inspect.getfile(plugin)).parents[1] / "engines"
+        return (plugin.files()[0].parent if self.is_outside else here) / f"{self.name}{end}"
 
     def rows(self, script: ModuleType, *words: str) -> list[dict[str, Any]]:
         """Return the rows of a script of the conformance set, run in this engine's Python.
@@ -59,7 +63,7 @@ class Engine:
             return [{"reason": self.missing}]
         file = self.file("_conformance.py")
         if not file.exists():
-            return [{"reason": f"no file {file.name}"}]
+            return [{"reason": f"{self.name} is not an engine of the conformance set: there is no file {file.name}"}]
         path = {} if self.is_outside else {"PYTHONPATH": str(Path(runner.__file__).parents[3])}
         return run(self.python, script, str(file), *words, environment=os.environ | path)
 
@@ -90,6 +94,8 @@ def write(names: Sequence[Engine], out: Path, settings: Sequence[str] = ()) -> P
         old = read(stored)
         is_new = old["engine"].isin(table["engine"]) & old["versions"].isin(["", *table["versions"]])
         table = pd.concat([old[~is_new], table]).sort_values(["engine", "versions"], kind="stable")
+    # an engine may be named twice, or its release be installed here and in an environment
+    table = table.drop_duplicates(["engine", "versions", "case", "term"], keep="last")
     table.to_csv(stored, index=False)
     place = out / ", ".join(releases).replace(" ", "-").replace(",-", ",")
     words = [f"+experiment={GRADIENTS}", f"backends=[{','.join(backends)}]", f"results_dir='{place}'", *settings]
@@ -122,7 +128,8 @@ def run(
             if done.returncode != runner.WRONG:
                 done.check_returncode()
         except (OSError, subprocess.SubprocessError) as error:
-            last = printable((getattr(error, "stderr", "") or "").strip().rpartition("\n")[2])
+            # after the frames of a traceback, which are indented, are the lines of the error
+            last = printable(re.split(r"^ .*\n", getattr(error, "stderr", "") or "", flags=re.MULTILINE)[-1])
             how = str(error).rpartition("]' ")[2]
             reason = f"stopped: {how} {last[-200:]}".strip()
         output.seek(0)
