@@ -42,11 +42,9 @@ class Engine:
         """Whether the harness runs it in a Python of its own."""
         self.is_here = not self.is_outside and not self.release
         self.python = sys.executable if self.is_here else str(environments.python_of(word))
-        self.missing = entry.reason if self.is_here else self._missing()
+        libraries = getattr(self.plugin, "libraries", ())
+        self.missing = entry.reason if self.is_here else environments.missing(word, None, libraries) or ""
         """Why it cannot run, or empty."""
-
-    def _missing(self) -> str:
-        return environments.missing(self.word, None, getattr(self.plugin, "libraries", ())) or ""
 
     def file(self, end: str) -> Path:
         """Return the file ``NAME`` + ``end`` in the folder ``engines`` of the backend's engine, which may not exist."""
@@ -144,7 +142,9 @@ def _page(table: pd.DataFrame) -> str:
         [name, versions, *((own["is_right"] == verdict).sum() for verdict in ("True", "False")), f"`{own['command'].iloc[0]}`"]
         for (name, versions), own in table.groupby(["engine", "versions"], sort=False)
     ]  # fmt: skip
-    told = _released(table[table["reason"] != ""])
+    release = table["versions"].str.split(";").str[0].where(table["versions"] != "", table["engine"])
+    table = table.assign(release=release)  # the engine's first library with its version, or the engine
+    told, run = (table[table[name] != ""] for name in ("reason", "case"))
     cases = told["case"].str.cat(told["term"].where(told["is_right"] == "False", ""), sep=" ").str.strip()
     reasons = told.assign(case=cases).drop_duplicates(["release", "case"]).groupby(["release", "reason"])["case"]
     notes = [f"- {', '.join([name, *filter(None, of)])}: {printable(why)[:240]}" for (name, why), of in reasons]
@@ -152,18 +152,12 @@ def _page(table: pd.DataFrame) -> str:
         "# Conformance of physics engines", "",
         *_markdown(["engine", "versions", "right", "not right", "command"], engines), "",
         "The fewest digits of a case's derivatives. own: compared with the engine's own differences. -: not run. ?: cannot tell.", "",
-        *by_case(table), "", *changes(table), "", *notes, "",
+        *_by_case(run), "", *_changes(run), "", *notes, "",
     ])  # fmt: skip
 
 
-def _released(table: pd.DataFrame) -> pd.DataFrame:
-    """Return rows with their release: the engine's first library with its version, or the engine."""
-    return table.assign(release=table["versions"].str.split(";").str[0].where(table["versions"] != "", table["engine"]))
-
-
-def by_case(table: pd.DataFrame) -> list[str]:
+def _by_case(run: pd.DataFrame) -> list[str]:
     """Return the Markdown lines of a table of cases by engines, with a column per release, from stored rows of text."""
-    run = _released(table[table["case"] != ""])
     if run.empty:
         return []
     run = run.assign(seconds=pd.to_numeric(run["seconds"]))
@@ -174,10 +168,10 @@ def by_case(table: pd.DataFrame) -> list[str]:
     return _markdown(["case", *cells], list(cells.itertuples()))
 
 
-def changes(table: pd.DataFrame) -> list[str]:
+def _changes(run: pd.DataFrame) -> list[str]:
     """Return the Markdown lines of a table of verdicts that differ between releases of an engine, from stored rows of text."""
     lines = []
-    for _, own in _released(table[table["case"] != ""]).groupby("engine", sort=False):
+    for _, own in run.groupby("engine", sort=False):
         verdicts = own.pivot(index=["case", "term"], columns="release", values="is_right").dropna()
         changed = verdicts[verdicts.nunique(axis=1) > 1].replace({"True": "right", "False": "wrong", "": "?"})
         if len(changed):

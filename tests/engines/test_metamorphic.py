@@ -91,14 +91,11 @@ def test_what_a_model_or_an_engine_lacks_is_not_checked():
 
 def test_files_that_a_model_includes_and_its_meshes_are_read(tmp_path):
     (tmp_path / "mesh").mkdir()
-    (tmp_path / "mesh" / "cube.obj").write_text(
-        "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1))
-        + "f 1 2 3\nf 2 3 4\nf 5 6 7\nf 1 2 5\n"
-    )
+    (tmp_path / "mesh" / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n")
     (tmp_path / "options.xml").write_text('<mujoco><compiler meshdir="mesh"/><option gravity="0 0 -2"/></mujoco>')
     (tmp_path / "model.xml").write_text(
-        '<mujoco><include file="options.xml"/><asset><mesh name="cube" file="cube.obj"/></asset><worldbody>'
-        '<body><joint axis="0 1 0"/><geom type="mesh" mesh="cube"/></body></worldbody></mujoco>'
+        '<mujoco><include file="options.xml"/><asset><mesh name="a" file="a.obj"/></asset><worldbody>'
+        '<body><joint axis="0 1 0"/><geom type="mesh" mesh="a"/></body></worldbody></mujoco>'
     )
     subject = metamorphic.Subject(Model, tmp_path / "model.xml", steps=2)
     assert subject.model.model.opt.gravity[2] == -2
