@@ -6,6 +6,7 @@ and gravity pulls along the slide with -1.128 N instead of 0.425 N.
 """
 
 import mujoco
+import numpy as np
 from brax.generalized import pipeline
 from brax.io import mjcf
 
@@ -16,4 +17,6 @@ model = mujoco.MjModel.from_xml_path(str(case.model))
 data = mujoco.MjData(model)
 data.qpos[:], data.qvel[:] = case.qpos, case.qvel
 mujoco.mj_forward(model, data)
-print(data.qM, pipeline.init(mjcf.load_model(model), case.qpos, case.qvel).mass_mx)
+mass = np.empty((model.nv, model.nv))
+mujoco.mj_fullM(model, data, mass)
+print(mass, pipeline.init(mjcf.load_model(model), case.qpos, case.qvel).mass_mx)
