@@ -6,8 +6,8 @@ step, -0.151 rad/s per metre for the rate about x by y, where differences are 0.
 ``bench/engines/conformance`` on the path.
 """
 
-import runner
+from runner import cases, load
 
-Engine = runner.load("plugins/engines/newton_conformance.py", "Engine")["Engine"]
-(case,) = runner.cases("free_joint")
-print((Engine().gradient(case)["qpos"] @ case.tangent())[:3], case.data["weights"]["qpos"][:3])
+(case,) = cases("free_joint")
+engine = load("plugins/engines/newton_conformance.py", "Engine")["Engine"]()
+print((engine.gradient(case)["qpos"] @ case.tangent())[:3], case.data["weights"]["qpos"])

@@ -32,6 +32,8 @@ class Engine(SteppedEngine):
     def build(self, case):
         """Return the system, and an actuator for each control."""
         root = ElementTree.parse(case.model).getroot()
+        if root.find(".//joint[@type='ball']") is not None:
+            raise NotImplementedError("ball joints are not supported")
         others = [
             number for motor in root.iter("motor") for number in motor.get("gear", "").split()[1:] if float(number)
         ]
