@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import subprocess
 import sys
 import time
 from collections.abc import Sequence
@@ -41,6 +42,12 @@ def main(words: Sequence[str]) -> int:
     raise UserError(f"engines: {' '.join(given)} is not a request: {USAGE}")
 
 
+def _split(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the names of engines and the settings ``KEY=VALUE`` among words."""
+    settings = [word for word in words if "=" in word and "==" not in word]
+    return [word for word in words if word not in settings], settings
+
+
 def _install(words: Sequence[str], again: bool) -> int:
     """Make the environments of ``NAME`` or ``NAME==VERSION``; return 1 if an engine cannot be used then."""
     files = {word: table.Engine(word).file(".txt") for word in words}
@@ -60,11 +67,15 @@ def _install(words: Sequence[str], again: bool) -> int:
 
 def _table(words: Sequence[str]) -> int:
     """Write the table of the named engines, or of all, and print the page's path."""
-    settings = [word for word in words if "=" in word and "==" not in word]
-    names = [word for word in words if word not in settings]
+    names, settings = _split(words)
     places = [word for word in settings if word.startswith("out=")]
     out = local_path("out", places[-1].partition("=")[2]) if places else OUT
-    print(table.write([table.Engine(name) for name in names], out, [word for word in settings if word not in places]))
+    settings = [word for word in settings if word not in places]
+    # before the set runs for minutes
+    plan = [sys.executable, "-m", "bench", "plan", f"+experiment={table.GRADIENTS}", *settings]
+    if settings and subprocess.run(plan, stdout=subprocess.DEVNULL).returncode:
+        raise UserError(f"engines table: the experiment {table.GRADIENTS} refuses {' '.join(settings)}")
+    print(table.write([table.Engine(name) for name in names], out, settings))
     return 0
 
 
@@ -83,11 +94,10 @@ def _metamorphic(model: str, words: Sequence[str]) -> int:
     """Print a line per property of an engine on a model, by default of ``mujoco``; return 1 if one is broken, or all unchecked."""
     if not Path(model).is_file():
         raise UserError(f"engines metamorphic: the file {model} does not exist: {USAGE}")
-    settings = [word for word in words if "=" in word and "==" not in word]
-    if strange := [word for word in settings if not re.fullmatch(r"steps=[1-9]\d*|seed=\d+", word)]:
+    names, settings = _split(words)
+    if strange := [*names[1:], *(word for word in settings if not re.fullmatch(metamorphic.SETTING, word))]:
         raise UserError(f"engines metamorphic: {' '.join(strange)} is not a setting: {USAGE}")
-    name = next((word for word in words if word not in settings), "mujoco")
-    rows = table.Engine(name).rows(metamorphic, str(Path(model).resolve()), *settings)
+    rows = table.Engine([*names, "mujoco"][0]).rows(metamorphic, str(Path(model).resolve()), *settings)
     if "property" not in rows[0]:
         raise UserError(f"engines metamorphic: {rows[0]['reason']}")
     for row in rows:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -18,7 +19,7 @@ import pandas as pd
 from bench.engines import environments
 from bench.engines.backend import EngineBackend
 from bench.engines.conformance import runner
-from bench.errors import printable
+from bench.errors import UserError, printable
 from bench.model import registry
 
 COLUMNS = ("engine", "versions", *runner.COLUMNS, "command")
@@ -32,23 +33,24 @@ class Engine:
     """A backend's engine: ``NAME``, or ``NAME==VERSION`` in an environment of another release."""
 
     def __init__(self, word: str) -> None:
-        self.word, (self.name, _, self.release) = word, word.partition("==")
+        self.word, (self.name, sign, self.release) = word, word.partition("==")
+        if sign and not self.release:
+            raise UserError(f"engine {word} has no release: write {word}VERSION or {word}newest")
         entry = registry.find("backends", self.name)
         self.plugin: Any = entry.plugin
         self.is_outside = self.plugin is not None and issubclass(self.plugin, EngineBackend)
         """Whether the harness runs it in a Python of its own."""
         self.is_here = not self.is_outside and not self.release
         self.python = sys.executable if self.is_here else str(environments.python_of(word))
-        self.missing = entry.reason if self.is_here else self._missing()
+        libraries = getattr(self.plugin, "libraries", ())
+        self.missing = entry.reason if self.is_here else environments.missing(word, None, libraries) or ""
         """Why it cannot run, or empty."""
-
-    def _missing(self) -> str:
-        return environments.missing(self.word, None, getattr(self.plugin, "libraries", ())) or ""
 
     def file(self, end: str) -> Path:
         """Return the file ``NAME`` + ``end`` in the folder ``engines`` of the backend's engine, which may not exist."""
-        here = Path(inspect.getfile(self.plugin)).parents[1] / "engines"
-        return (self.plugin.files()[0].parent if self.is_outside else here) / f"{self.name}{end}"
+        plugin: Any = registry.usable("backends", self.name)
+        here = Path(inspect.getfile(plugin)).parents[1] / "engines"
+        return (plugin.files()[0].parent if self.is_outside else here) / f"{self.name}{end}"
 
     def rows(self, script: ModuleType, *words: str) -> list[dict[str, Any]]:
         """Return the rows of a script of the conformance set, run in this engine's Python.
@@ -59,7 +61,7 @@ class Engine:
             return [{"reason": self.missing}]
         file = self.file("_conformance.py")
         if not file.exists():
-            return [{"reason": f"no file {file.name}"}]
+            return [{"reason": f"{self.name} is not an engine of the conformance set: there is no file {file.name}"}]
         path = {} if self.is_outside else {"PYTHONPATH": str(Path(runner.__file__).parents[3])}
         return run(self.python, script, str(file), *words, environment=os.environ | path)
 
@@ -90,6 +92,8 @@ def write(names: Sequence[Engine], out: Path, settings: Sequence[str] = ()) -> P
         old = read(stored)
         is_new = old["engine"].isin(table["engine"]) & old["versions"].isin(["", *table["versions"]])
         table = pd.concat([old[~is_new], table]).sort_values(["engine", "versions"], kind="stable")
+    # an engine may be named twice, or its release be installed here and in an environment
+    table = table.drop_duplicates(["engine", "versions", "case", "term"], keep="last")
     table.to_csv(stored, index=False)
     place = out / ", ".join(releases).replace(" ", "-").replace(",-", ",")
     words = [f"+experiment={GRADIENTS}", f"backends=[{','.join(backends)}]", f"results_dir='{place}'", *settings]
@@ -122,7 +126,8 @@ def run(
             if done.returncode != runner.WRONG:
                 done.check_returncode()
         except (OSError, subprocess.SubprocessError) as error:
-            last = printable((getattr(error, "stderr", "") or "").strip().rpartition("\n")[2])
+            # after the frames of a traceback, which are indented, are the lines of the error
+            last = printable(re.split(r"^ .*\n", getattr(error, "stderr", "") or "", flags=re.MULTILINE)[-1])
             how = str(error).rpartition("]' ")[2]
             reason = f"stopped: {how} {last[-200:]}".strip()
         output.seek(0)
@@ -137,7 +142,9 @@ def _page(table: pd.DataFrame) -> str:
         [name, versions, *((own["is_right"] == verdict).sum() for verdict in ("True", "False")), f"`{own['command'].iloc[0]}`"]
         for (name, versions), own in table.groupby(["engine", "versions"], sort=False)
     ]  # fmt: skip
-    told = _released(table[table["reason"] != ""])
+    release = table["versions"].str.split(";").str[0].where(table["versions"] != "", table["engine"])
+    table = table.assign(release=release)  # the engine's first library with its version, or the engine
+    told, run = (table[table[name] != ""] for name in ("reason", "case"))
     cases = told["case"].str.cat(told["term"].where(told["is_right"] == "False", ""), sep=" ").str.strip()
     reasons = told.assign(case=cases).drop_duplicates(["release", "case"]).groupby(["release", "reason"])["case"]
     notes = [f"- {', '.join([name, *filter(None, of)])}: {printable(why)[:240]}" for (name, why), of in reasons]
@@ -145,18 +152,12 @@ def _page(table: pd.DataFrame) -> str:
         "# Conformance of physics engines", "",
         *_markdown(["engine", "versions", "right", "not right", "command"], engines), "",
         "The fewest digits of a case's derivatives. own: compared with the engine's own differences. -: not run. ?: cannot tell.", "",
-        *by_case(table), "", *changes(table), "", *notes, "",
+        *_by_case(run), "", *_changes(run), "", *notes, "",
     ])  # fmt: skip
 
 
-def _released(table: pd.DataFrame) -> pd.DataFrame:
-    """Return rows with their release: the engine's first library with its version, or the engine."""
-    return table.assign(release=table["versions"].str.split(";").str[0].where(table["versions"] != "", table["engine"]))
-
-
-def by_case(table: pd.DataFrame) -> list[str]:
+def _by_case(run: pd.DataFrame) -> list[str]:
     """Return the Markdown lines of a table of cases by engines, with a column per release, from stored rows of text."""
-    run = _released(table[table["case"] != ""])
     if run.empty:
         return []
     run = run.assign(seconds=pd.to_numeric(run["seconds"]))
@@ -167,10 +168,10 @@ def by_case(table: pd.DataFrame) -> list[str]:
     return _markdown(["case", *cells], list(cells.itertuples()))
 
 
-def changes(table: pd.DataFrame) -> list[str]:
+def _changes(run: pd.DataFrame) -> list[str]:
     """Return the Markdown lines of a table of verdicts that differ between releases of an engine, from stored rows of text."""
     lines = []
-    for _, own in _released(table[table["case"] != ""]).groupby("engine", sort=False):
+    for _, own in run.groupby("engine", sort=False):
         verdicts = own.pivot(index=["case", "term"], columns="release", values="is_right").dropna()
         changed = verdicts[verdicts.nunique(axis=1) > 1].replace({"True": "right", "False": "wrong", "": "?"})
         if len(changed):

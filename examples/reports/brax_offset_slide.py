@@ -14,6 +14,6 @@ from bench.engines import conformance
 (case,) = conformance.cases("offset_slide")
 model = mujoco.MjModel.from_xml_path(str(case.model))
 data = mujoco.MjData(model)
-data.qpos[:], data.qvel[:] = case.qpos, case.qvel
+data.qpos, data.qvel = case.qpos, case.qvel
 mujoco.mj_forward(model, data)
-print(data.qM, pipeline.init(mjcf.load_model(model), case.qpos, case.qvel).mass_mx)
+print(data.M, pipeline.init(mjcf.load_model(model), case.qpos, case.qvel).mass_mx)

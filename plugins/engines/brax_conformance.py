@@ -17,7 +17,7 @@ DIFFERENT = {
     "joint[@frictionloss]": "no friction loss",
     "equality/": "no equalities",
     "tendon/": "no tendons",
-    "motor[@gear]": "a motor has one axis",
+    "joint[@damping]": "dampers of joints are explicit",
 }
 """Elements that Brax runs in another way than MuJoCo, or ignores."""
 
@@ -31,5 +31,17 @@ class Engine(SteppedEngine):
 
     def build(self, case):
         """Return the system, and an actuator for each control."""
-        self.differs[case.name] = differing(ElementTree.parse(case.model).getroot(), DIFFERENT)
+        root = ElementTree.parse(case.model).getroot()
+        if root.find(".//joint[@type='ball']") is not None:
+            raise NotImplementedError("ball joints are not supported")
+        others = [
+            number for motor in root.iter("motor") for number in motor.get("gear", "").split()[1:] if float(number)
+        ]
+        self.differs[case.name] = differing(
+            root, DIFFERENT | {"actuator": "a motor has one axis"} if others else DIFFERENT
+        )
         return System(mjcf.load(str(case.model)).replace(solver_maxls=60)), np.eye(case.controls.shape[1])
+
+    def _force(self, case, x, force):
+        """Return the controls of the system's own actuators, of which there may be fewer than velocities."""
+        return force

@@ -26,7 +26,7 @@ class SteppedEngine:
         if case.name not in self._built:
             self._built[case.name] = self.build(case)
         model, arms = self._built[case.name]
-        path = [np.concatenate([case.qpos, self._turned(case, case.qpos, case.qvel)])[self._order(case)]]
+        path = [self._state(case, case.qpos, case.qvel)]
         for control in case.controls:
             force = self._force(case, path[-1], arms @ control)
             path.append(model.step(path[-1][:, None], force[:, None])[:, 0])
@@ -49,13 +49,20 @@ class SteppedEngine:
             v[rates] += 2 * (q[i] * across + np.cross(axis, across))
         return v
 
+    def _state(self, case, q, v):
+        """Return MuJoCo's positions and velocities, or forces, as the engine has them."""
+        return np.concatenate([q, self._turned(case, q, v)])[self._order(case)]
+
+    def _split(self, case, x):
+        """Return MuJoCo's positions of one of the engine's states, and velocities in the engine's frames."""
+        return np.split(x[np.argsort(self._order(case))], [case.qpos.size])
+
     def _force(self, case, x, force):
         """Return the engine's force at one of its states."""
-        order, n_q = self._order(case), case.qpos.size
-        return self._turned(case, x[np.argsort(order)][:n_q], force)[order[n_q:] - n_q]
+        return self._state(case, self._split(case, x)[0], force)[case.qpos.size :]
 
     def _cost(self, case, x):
-        q, v = np.split(x[np.argsort(self._order(case))], [case.qpos.size])
+        q, v = self._split(case, x)
         return case.cost(q, self._turned(case, q, v, -1))
 
     def rollout(self, case):
@@ -65,14 +72,13 @@ class SteppedEngine:
     def gradient(self, case):
         """Return the derivatives by state and controls."""
         *path, end = self._path(case)
-        slope, by_control = _slope(lambda x: self._cost(case, x), end), []
+        slope, by_control, n_q = _slope(lambda x: self._cost(case, x), end), [], case.qpos.size
         for x, control in zip(path[::-1], case.controls[::-1], strict=True):
             slope, by_u = self._pulled(case, x, control, slope)
             by_control.insert(0, by_u)
-        by_q, by_v = np.split(slope[np.argsort(self._order(case))], [case.qpos.size])
-        by_q = by_q + _slope(lambda q: by_v @ self._turned(case, q, case.qvel), case.qpos)
-        by_v = _slope(lambda v: by_v @ self._turned(case, case.qpos, v), case.qvel)
-        return {"qpos": by_q, "qvel": by_v, "controls": np.array(by_control)}
+        start = np.append(case.qpos, case.qvel)
+        by_start = _slope(lambda start: slope @ self._state(case, *np.split(start, [n_q])), start)
+        return {"qpos": by_start[:n_q], "qvel": by_start[n_q:], "controls": np.array(by_control)}
 
     def _pulled(self, case, x, control, slope):
         """Return the derivatives by state and control of the sum of slope times the next state."""

@@ -2,12 +2,10 @@
 
 import importlib.metadata
 
-import genesis as gs
-import torch
+import numpy as np
 from free_bodies import differing, without_motors
-from genesis.utils.misc import qd_to_torch
+from genesis_scene import Scene
 
-gs.init(backend=gs.cpu, precision="64", logging_level="error")
 DIFFERENT = {
     "geom[@condim='1']": "contacts have friction",
     "geom[@condim='4']": "no torsional friction",
@@ -27,46 +25,28 @@ class Engine:
     versions = {name: importlib.metadata.version(name) for name in ("genesis-world", "torch")}
 
     def __init__(self):
-        self.differs, self._built = {}, {}
+        self.differs = {"sparse_chain": "geoms that overlap in the reference pose do not touch"}
+        self._built = {}
 
-    def _build(self, case):
-        root, arms = without_motors(case)
-        self.differs[case.name] = differing(root, DIFFERENT)
-        scene = gs.Scene(
-            sim_options=gs.options.SimOptions(dt=float(root.find("option").get("timestep")), requires_grad=True),
-            rigid_options=gs.options.RigidOptions(
-                constraint_timeconst=0.02, iterations=100, tolerance=1e-14
-            ),
-            show_viewer=False,
-        )  # fmt: skip
-        robot = scene.add_entity(gs.morphs.MJCF(file=root, default_armature=0.0))
-        scene.build()
-        return arms, scene, robot
-
-    def _run(self, case):
-        """Return the cost and the inputs as tensors, the motors' arms and the scene."""
+    def _of(self, case):
+        """Return the case's scene, its motors' arms, and the inputs and weights of its rollout."""
         if case.name not in self._built:
-            self._built[case.name] = self._build(case)
-        arms, scene, robot = self._built[case.name]
-        scene.reset()
-        velocity, forces = (torch.tensor(part, requires_grad=True) for part in (case.qvel, case.controls @ arms.T))
-        robot.set_qpos(torch.tensor(case.qpos), zero_velocity=False)
-        robot.set_dofs_velocity(velocity)
-        for force in forces:
-            robot.control_dofs_force(force)
-            scene.step()
-        after, weights = scene.rigid_solver.get_state(), case.data["weights"]
-        by = (torch.tensor(weights[term], dtype=torch.float64) for term in ("qpos", "qvel"))
-        cost = sum((weight * part).sum() for weight, part in zip(by, (after.qpos, after.dofs_vel), strict=True))
-        return cost, (velocity, forces), arms, scene
+            root, arms = without_motors(case)
+            self.differs.setdefault(case.name, differing(root, DIFFERENT))
+            simulation = {"dt": float(root.find("option").get("timestep"))}
+            rigid = {"constraint_timeconst": 0.02, "iterations": 100, "tolerance": 1e-14}
+            self._built[case.name] = Scene(root, simulation, rigid), arms
+        scene, arms = self._built[case.name]
+        weights = np.concatenate([case.data["weights"][term] for term in ("qpos", "qvel")])
+        return scene, arms, (case.qpos, case.qvel, case.controls @ arms.T), weights
 
     def rollout(self, case):
         """Return the cost of a case."""
-        return float(self._run(case)[0].detach())
+        scene, _, inputs, weights = self._of(case)
+        return float(scene.run(*inputs)[0].detach().numpy().ravel() @ weights)
 
     def gradient(self, case):
-        """Return the derivatives by state and controls. The tape lacks the positions, so the solver has theirs."""
-        cost, inputs, arms, scene = self._run(case)
-        by_v, by_force = torch.autograd.grad(cost, inputs)
-        by_q = qd_to_torch(scene.rigid_solver.rigid_info.qpos.grad, copy=True)
-        return {"qpos": by_q.numpy(), "qvel": by_v.numpy(), "controls": by_force.numpy() @ arms}
+        """Return the derivatives by state and controls."""
+        scene, arms, inputs, weights = self._of(case)
+        by_q, by_v, by_force = scene.pull(*inputs, weights)
+        return {"qpos": by_q, "qvel": by_v, "controls": by_force @ arms}

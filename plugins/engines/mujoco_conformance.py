@@ -28,6 +28,8 @@ class Model:
 
     def __init__(self, mjcf: str) -> None:
         self.model = mujoco.MjModel.from_xml_string(mjcf)
+        if self.model.na:
+            raise NotImplementedError("actuators with activation states are not supported")
         self.data = mujoco.MjData(self.model)
         if self.model.nkey:
             mujoco.mj_resetDataKeyframe(self.model, self.data, 0)

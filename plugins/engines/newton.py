@@ -1,8 +1,11 @@
 """Newton's solvers on Warp: a world per column, a tape per step."""
 
+import xml.etree.ElementTree as ElementTree
+
 import numpy as np
 import warp as wp
 from newton_worlds import Worlds, newton
+from twin_bodies import bodies
 
 GAP = 10.0
 """Distance [m] up to which contacts are generated. The solver's forces depend on the distance itself."""
@@ -44,7 +47,7 @@ class _Batch(Worlds):
         self._axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
         one, all_worlds = newton.ModelBuilder(up_axis="Z"), newton.ModelBuilder(up_axis="Z")
         law = program["contact"]
-        shape = newton.ModelBuilder.ShapeConfig(
+        one.default_shape_cfg = newton.ModelBuilder.ShapeConfig(
             density=0.0,
             ke=law.get("stiffness", 0.0),
             kd=law.get("damping", 0.0),
@@ -53,40 +56,17 @@ class _Batch(Worlds):
             gap=GAP,
             restitution=program["parameters"].get("restitution", 0.0),
         )
-        self._add_bodies(one, shape)
+        root = bodies(program)
+        for joint in root.iter("joint") if not self.has_joints else ():
+            joint.attrib = {"type": "free"}
+        one.add_mjcf(ElementTree.tostring(root, encoding="unicode"))
         all_worlds.replicate(one, width)
-        if program["has_ground"]:
-            all_worlds.add_ground_plane(cfg=shape)
         model = all_worlds.finalize(requires_grad=program["backend"]["solver"] != "xpbd")
         model.set_gravity(tuple(program["gravity"]))
         super().__init__(model, self._new_solver(model), width, self._n, program["dt"], bool(program["contacts"]))
 
     def _new_solver(self, model):
         return newton.solvers.SolverFeatherstone(model, angular_damping=0.0)
-
-    def _add_bodies(self, builder, shape):
-        links, chains = [], []
-        touching = {body for contact in self._program["contacts"] for body in contact["bodies"]}
-        for i, body in enumerate(self._program["bodies"]):
-            inertia = wp.mat33(np.diag(body["inertia"]))
-            links.append(
-                builder.add_link(mass=body["mass"], com=wp.vec3(*body["com"]), inertia=inertia, lock_inertia=True)
-            )
-            if i in touching:
-                pose = wp.transform(wp.vec3(*body["centre"]), wp.quat_identity())
-                builder.add_shape_sphere(links[i], xform=pose, radius=body["radius"], cfg=shape)
-            if not self.has_joints:
-                continue
-            parent = links[body["parent"]] if body["parent"] >= 0 else -1
-            add = builder.add_joint_prismatic if body["joint"] == "slide" else builder.add_joint_revolute
-            joint = add(
-                parent, links[i], axis=wp.vec3(*body["axis"]), armature=0.0, target_ke=0.0, target_kd=0.0, friction=0.0
-            )
-            if parent < 0:
-                chains.append([])
-            chains[-1].append(joint)
-        for chain in chains:
-            builder.add_articulation(chain)
 
     def jacobians(self, x, u):
         slopes = [np.broadcast_to(row[:, None], x.shape) for row in np.eye(len(x))]

@@ -156,11 +156,27 @@ def test_twins_of_a_swept_scene_are_panels_of_their_own():
     assert list(readable(lines)["horizon [steps]"]) == ["2", "2", "3", "3"]
 
 
-def test_two_engines_on_a_robot_part_in_a_step(tmp_path):
-    robot = "mjcf[file=cube.xml,theta=velocity,noise=parameter]"
-    words = {"contacts": ["penalty"], "backends": ["mujoco[cone=elliptic]"], "estimators": ["plain"], "samples": 2}
-    row = bench.run(study="twins", name="own", scenes=[robot], results_dir=tmp_path, workers=0, **words).iloc[0]
+def of_a_robot(study, backend, folder):
+    """Return the row of a study on a robot's own file."""
+    parts = {
+        "scenes": ["mjcf[file=cube.xml,theta=velocity,noise=parameter]"],
+        "contacts": ["penalty"],
+        "estimators": ["plain"],
+    }
+    counts = {"samples": 2, "repeats": 2, "reference": {"samples": 256}, "workers": 0}
+    return bench.run(study=study, name="own", backends=[backend], results_dir=folder, **parts, **counts).iloc[0]
+
+
+def test_two_engines_on_a_robot_part_in_a_step_and_none_is_compared_with_itself(tmp_path):
+    row = of_a_robot("twins", "mujoco[cone=elliptic]", tmp_path)
     assert row["reason"].startswith("the engines part in step ")
+    assert "no backend but mujoco" in of_a_robot("twins", "mujoco", tmp_path)["reason"]
+
+
+def test_a_robot_has_a_program_error_and_no_physics_to_compare_with(tmp_path):
+    row = of_a_robot("three_errors", "mujoco", tmp_path)
+    assert row["program_error_rel"] < 1e-6
+    assert np.isnan(row["model_error_rel"])
 
 
 # ------------------------------------------------------------------------------------------------------ swept axes

@@ -12,7 +12,7 @@ import contextlib
 import copy
 import functools
 import itertools
-import json
+import re
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
@@ -42,6 +42,10 @@ TOUCH = 1e-6
 """Largest gap of a contact or limit at which accelerations may jump [m, rad]."""
 
 
+SETTING = r"steps=[1-9]\d*|seed=\d+"
+"""What a setting of the command looks like."""
+
+
 class Subject:
     """A model in the variants of an engine, and states of a random rollout."""
 
@@ -53,14 +57,15 @@ class Subject:
             for outer, node in nodes:
                 place = list(outer).index(node)
                 outer[place : place + 1] = list(ElementTree.parse(self._folder / node.get("file", "")).getroot())
-        for number, joint in enumerate(_joints(root.find("worldbody"))):
+        for number, joint in enumerate(_joints(root)):
             joint.set("name", joint.get("name", f"joint {number}"))
         options = _first(root, "option")
         # options of all models: other settings of a solver have to lead to the same solution
         options.attrib.update({"tolerance": "1e-14", "iterations": "100", "ls_iterations": "50"})
         _first(options, "flag").set("warmstart", "disable")
-        self.model, self.layout = self.variant(), _layout(root)
-        self.quaternions = [int(of_q[-4]) for of_q, of_v in self.layout.values() if of_q.size > of_v.size]
+        self.model, self._layout = self.variant(), _layout(root)
+        if root.find("worldbody") is None or not len(self.model.start[0]):
+            raise NotImplementedError("the file has no worldbody with joints")
         self.random, n_u = np.random.default_rng(seed), len(root.findall("actuator/*"))
         q, v = (np.array(part, dtype=float) for part in self.model.start)
         v = v + 0.3 * self.random.normal(size=v.size)
@@ -83,6 +88,18 @@ class Subject:
         """Return the engine's model of MJCF, whose files are in the folder of the model."""
         with contextlib.chdir(self._folder):
             return self._make(ElementTree.tostring(root, encoding="unicode"))
+
+    @property
+    def layout(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """The places of each joint's positions and velocities. Raises :class:`NotImplementedError` for joints of no file."""
+        if sum(of_q.size for of_q, _ in self._layout.values()) != len(self.states[0][0]):
+            raise NotImplementedError("the engine makes joints that the file does not name, as of replicate")
+        return self._layout
+
+    @property
+    def quaternions(self) -> list[int]:
+        """The places of quaternions in the positions."""
+        return [int(of_q[-4]) for of_q, of_v in self.layout.values() if of_q.size > of_v.size]
 
     def moved(self, q: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return positions after a motion w ``(n_v,)``; rotations are about axes of the body."""
@@ -115,19 +132,15 @@ def accelerations(path: str = "", /, **attributes: str) -> Results:
 
 def permuted(subject: Subject) -> Iterator[Any]:
     """Yield accelerations of the model with bodies and geoms in reverse order."""
-    # elements from which an engine makes bodies of its own
-    if strange := [
-        name for name in ("replicate", "composite", "flexcomp", "attach") if subject.root.find(f".//{name}") is not None
-    ]:
-        raise NotImplementedError(f"the model has {', '.join(strange)}")
     root: Any = copy.deepcopy(subject.root)
+    places = subject.layout
     for keyframes in root.findall("keyframe"):
         root.remove(keyframes)
-    for body, tag in itertools.product([root.find("worldbody"), *root.iterfind(".//body")], ("body", "geom")):
-        places = [i for i, child in enumerate(body) if child.tag == tag]
-        for i, child in zip(places, [body[i] for i in places[::-1]], strict=True):
+    for body, tag in itertools.product([*root.iterfind("worldbody"), *root.iterfind(".//body")], ("body", "geom")):
+        alike = [i for i, child in enumerate(body) if child.tag == tag]
+        for i, child in zip(alike, [body[i] for i in alike[::-1]], strict=True):
             body[i] = child
-    model, parts = subject.made(root), [subject.layout[name] for name in _layout(root)]
+    model, parts = subject.made(root), [places[name] for name in _layout(root)]
     of_q, of_v = map(np.concatenate, zip(*parts, strict=True))
     for q, v, u in subject.states:
         yield np.array(model.acceleration(q[of_q], v[of_v], u))[np.argsort(of_v)]
@@ -290,14 +303,14 @@ def _first(root: Any, tag: str) -> Any:
 
 def _joints(body: Any) -> list[Any]:
     """Return the joints within a body, in MuJoCo's order."""
-    inner = [joint for child in body if child.tag in ("body", "frame") for joint in _joints(child)]
+    inner = [joint for child in body if child.tag in ("worldbody", "body", "frame") for joint in _joints(child)]
     return [child for child in body if child.tag in ("joint", "freejoint")] + inner
 
 
 def _layout(root: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return the places of each joint's positions and velocities, by name."""
     result, i, j = {}, 0, 0
-    for joint in _joints(root.find("worldbody")):
+    for joint in _joints(root):
         kind = joint.get("type", "free" if joint.tag == "freejoint" else "hinge")
         n_q, n_v = {"free": (7, 6), "ball": (4, 3)}.get(kind, (1, 1))
         result[joint.get("name")] = np.arange(i, i + n_q), np.arange(j, j + n_v)
@@ -307,14 +320,13 @@ def _layout(root: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 def main(engine: str, path: str, *words: str) -> None:
     """Print the rows of the class ``Model`` of a file as JSON, a row a line: ``[PROPERTY ...] [steps=60] [seed=0]``."""
-    module, names = runner.load(engine, "Model"), [word for word in words if word in PROPERTIES]
-    print(json.dumps({"versions": module.get("VERSIONS", {})}))
-    settings = (word.partition("=") for word in words if word not in PROPERTIES)
-    numbers: dict[str, Any] = {name: int(value) for name, _, value in settings}
-    found = set()
-    for row in check(module["Model"], path, *names, **numbers):
-        print(json.dumps(row), flush=True)
-        found.add(row["holds"])
+    names, settings = ([word for word in words if (word in PROPERTIES) == is_name] for is_name in (True, False))
+    if strange := [word for word in settings if not re.fullmatch(SETTING, word)]:
+        sys.exit(f"{strange[0]!r} is not a property or a setting; properties: {', '.join(PROPERTIES)}")
+    module = runner.load(engine, "Model")
+    numbers: dict[str, Any] = {name: int(value) for name, _, value in (word.partition("=") for word in settings)}
+    rows = runner.printed(module.get("VERSIONS", {}), check(module["Model"], path, *names, **numbers))
+    found = {row["holds"] for row in rows}
     sys.exit(runner.WRONG * (False in found or True not in found))
 
 

@@ -7,6 +7,7 @@ Such an item that is right fails, so that the line is removed.
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -55,5 +56,5 @@ def _judge(rows: Any, name: str, term: str) -> None:
 def pytest_collect_file(file_path: Path, parent: Any) -> EngineFile | None:
     """Collect files that define a class ``Engine`` and are named in the command."""
     is_named = file_path.suffix == ".py" and parent.session.isinitpath(file_path)
-    has_engine = is_named and "\nclass Engine" in file_path.read_text()
+    has_engine = is_named and re.search(r"^class Engine\b", file_path.read_text(), re.MULTILINE)
     return EngineFile.from_parent(parent, path=file_path) if has_engine else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 import json
 import runpy
@@ -71,7 +72,7 @@ class Case:
         is_turned = term == "qpos"
         size = 1.0 if is_turned else max(1.0, np.abs(getattr(self, term)).max(initial=0.0))
         basis = np.eye(self.qvel.size if is_turned else getattr(self, term).size)
-        return differences(lambda change: float(engine.rollout(self.moved(term, change))), basis, size)
+        return differences(lambda change: float(engine.rollout(copy.deepcopy(self).moved(term, change))), basis, size)
 
 
 def tangent(qpos: np.ndarray, quaternions: Sequence[int]) -> np.ndarray:
@@ -134,7 +135,10 @@ def check(engine: Any, case: Case) -> list[dict[str, Any]]:
     row |= {"case": case.name, "term": "all", "looks_like": "", "against": "", "reason": ""}
     started = time.perf_counter()
     try:
-        results = {"value": engine.rollout(case), **engine.gradient(case)}
+        # each call gets a case of its own, since an engine may write into its arrays
+        results = {"value": engine.rollout(copy.deepcopy(case)), **engine.gradient(copy.deepcopy(case))}
+        if strange := set(results) - {"value", *TERMS}:
+            raise ValueError(f"{', '.join(map(repr, sorted(strange)))} is not one of {', '.join(TERMS)}")
         seconds, differs = time.perf_counter() - started, getattr(engine, "differs", {}).get(case.name, "")
         row |= {"against": "own differences" if differs else "the set", "seconds": round(seconds, 4), "reason": differs}
         return [row | {"term": term} | _verdict(engine, case, term, found, differs) for term, found in results.items()]
@@ -161,6 +165,8 @@ def _verdict(engine: Any, case: Case, term: str, found: Any, differs: str) -> di
     if not np.isfinite(expected).all():
         return {"is_right": None, "reason": "own differences are not finite"}
     tolerance, scale = getattr(engine, "tolerance", "float64"), np.abs(expected).max(initial=1e-9)
+    if isinstance(tolerance, str) and tolerance not in TOLERANCES:
+        raise ValueError(f"{tolerance=} is not a number or one of {', '.join(TOLERANCES)}")
     error, margin = np.abs(result - expected), DOUBTS * (doubt + 0.0 * expected)
     limit = TOLERANCES.get(tolerance, tolerance) * scale + margin
     off, is_off = error.max(), error > limit
@@ -239,17 +245,24 @@ def load(path: str, name: str) -> dict[str, Any]:
     return module if name in module else sys.exit(f"{path} has no class {name}")
 
 
+def printed(versions: dict[str, str], rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Print versions and rows as JSON, each on a line as soon as it is known, and return the rows."""
+    print(json.dumps({"versions": versions}))
+    result = []
+    for row in rows:
+        print(json.dumps(row), flush=True)
+        result.append(row)
+    return result
+
+
 def main(path: str, *names: str) -> None:
     """Print the versions and the rows of the class ``Engine`` of a file as JSON, each on a line as soon as it is known."""
     try:
         own = cases(*names)
     except ValueError as error:
         sys.exit(str(error))
-    engine, rows = load(path, "Engine")["Engine"](), []
-    print(json.dumps({"versions": getattr(engine, "versions", {})}))
-    for row in (row for case in own for row in check(engine, case)):
-        rows.append(row)
-        print(json.dumps(row), flush=True)
+    engine = load(path, "Engine")["Engine"]()
+    rows = printed(getattr(engine, "versions", {}), (row for case in own for row in check(engine, case)))
     try:
         verify(rows)
     except AssertionError as error:
