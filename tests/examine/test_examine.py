@@ -465,7 +465,7 @@ def test_noise_may_be_a_key_of_jax():
     def slope(x, key):
         return 1.5 * jax.grad(cost)(x, key)
 
-    given = {"noise": "key", "sigma": 0.1, "calls": 1000, "progress": False}
+    given = {"noise": "key", "sigma": 0.1, "calls": 4000, "progress": False}
     report = bench.examine(cost, [1.0], grad="jax", **given)
     assert (report.derivative, report.use) == ("right", "usable"), str(report)
     assert bench.examine(cost, [1.0], grad=slope, **given).status == 1
