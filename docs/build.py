@@ -100,8 +100,8 @@ Beside the files of [every run](reading-results.md#files), each study writes its
   gradient and a converging cost whose gradient does not converge to that of the physics, with their errors at the largest and the smallest step.
 - `growth.csv`: gradient norms, singular values and growth rates with their intervals. `growth_verdicts.csv`: per problem the
   order of the best power law, the rate of the best exponential, both with their intervals, and the verdict. `exploding` needs
-  at least five horizons, an exponential that is 20 times as likely as the power law, and a rate above 0; `growing` means that the
-  order is above 0, and that the data do not decide between the two curves.
+  at least five horizons, an exponential that is 20 times as likely as the power law, and a rate above 0; `growing` means that
+  each norm is certainly above the one before, and that the data do not decide between the two curves.
 - `gradient_check.csv`: one line per check and step size. `gradient_components.csv`: one line per component of theta.
 - `twins.csv`: differences between an engine's model of a scene and the scene's own program, and their times.
 - `engines.csv`: one line per engine and scene: errors, statistics, times and memory of its gradients.

@@ -130,11 +130,11 @@ class Watch:
         self.rows.append(row)
         if not self.out:
             return
-        lines = [COLUMNS, *(row.values() for row in self.rows)]
+        lines = [one.values() for one in self.rows[self._written :]]
         try:
             with self.out.open("a" if self._written else "w", newline="") as file:
-                csv.writer(file).writerows(lines[self._written :])
-            self._written, self._unwritten = len(lines), ""
+                csv.writer(file).writerows(lines if self._written else [COLUMNS, *lines])
+            self._written, self._unwritten = len(self.rows), ""
         except OSError as error:
             self._unwritten = f", {self.out} cannot be written: {error}"
 

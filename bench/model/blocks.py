@@ -45,7 +45,7 @@ def _n_listed(ranges: str) -> int:
 def columns_in_cache(column_bytes: int) -> int:
     """Return the power of 2 of columns that fill at most half of a core's cache, within limits.
 
-    Batches of several sizes then have blocks of one size, for which a program is compiled once.
+    Batches whose sizes are powers of 2 then have blocks of one size on one or two threads, for which a program is compiled once.
     """
     columns = 1 << max(cache_bytes() // 2 // max(column_bytes, 1), 1).bit_length() - 1
     # larger blocks save no time

@@ -24,8 +24,8 @@ class LoopOps:
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
         """Return the last carry of ``carry = step(carry, x)`` over the leading axis of the leaves of ``xs``."""
-        for slices in zip(*xs, strict=True) if xs else [()] * length:
-            carry = step(carry, slices)
+        for _, *slices in zip(range(length), *xs, strict=True):
+            carry = step(carry, tuple(slices))
         return carry
 
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:

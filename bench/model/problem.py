@@ -156,7 +156,7 @@ class Problem(ABC):
                 self.usage.lower_s += seconds[1]
 
     def fit_blocks(self, column_bytes: int) -> None:
-        """Set the block size so that a block fills half of a core's cache, at ``column_bytes`` per rollout."""
+        """Set the block size so that a block fills at most half of a core's cache, at ``column_bytes`` per rollout."""
         self.block, self.threads = blocks.columns_in_cache(column_bytes), blocks.cores()
 
     @property

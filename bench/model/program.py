@@ -428,7 +428,7 @@ class Rollout(Program):
         own, e = (w[: -self.exogenous], w[-self.exogenous :]) if self.exogenous else (w, None)
         if not self.action_noise:
             theta = theta + scene.sigma * own
-        planned = scene.planned_controls(xp, theta)
+        planned = self._planned(xp, theta)
         scanned = [] if planned is None else [xp.broadcast_to(planned, (*planned.shape[:2], w.shape[1]))]
         if self.action_noise:
             noise = scene.sigma * self.drawn_actions(xp, w)
@@ -437,6 +437,11 @@ class Rollout(Program):
         # theta (d, 1) yields a single column, but the scan's carry needs all B columns
         state = State(*(xp.broadcast_to(part, (part.shape[0], w.shape[1])) for part in start))
         return theta, state, tuple(scanned)
+
+    def _planned(self, xp: Any, theta: Array) -> Array | None:
+        """Return the open-loop controls, ``(horizon, n_u, B)``, of which a scene may give those of one step for all; or None."""
+        planned = self.scene.planned_controls(xp, theta)
+        return None if planned is None else xp.broadcast_to(planned, (self.scene.horizon, *planned.shape[1:]))
 
     def drawn_actions(self, xp: Any, w: Array) -> Array:
         """Return the normal numbers whose multiples by sigma are the noise on the actions, ``(horizon, n_u, B)``."""
@@ -452,7 +457,7 @@ class Rollout(Program):
 
     def _rollout(self, ops: Ops, theta: Array, w: Array, theta_scored: Array | None) -> tuple[Array, Array]:
         scene, xp = self.scene, ops.xp
-        planned_scored = None if theta_scored is None else scene.planned_controls(xp, theta_scored)
+        planned_scored = None if theta_scored is None else self._planned(xp, theta_scored)
         drawn = () if theta_scored is None else (self.drawn_actions(xp, w),)
         theta, state, scanned = self.start(ops, theta, w)
         extra = drawn if planned_scored is None else (*drawn, planned_scored)

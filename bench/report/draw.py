@@ -21,7 +21,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FixedLocator
 
 from bench.experiment.columns import Column
-from bench.experiment.views import Chart, Mark, Style
+from bench.experiment.views import Chart, Style
 from bench.report.colours import looks_by_name
 from bench.report.names import in_words
 from bench.report.scales import LARGEST, SMALLEST, log_axis
@@ -216,19 +216,19 @@ def _is_log(column: Column, values: Any) -> bool:
 
 
 def _scale(
-    chart: Chart, panel: Axes, which: Literal["x", "y"], column: Column, rows: pd.DataFrame, few: bool = False
+    chart: Chart, panel: Axes, which: Literal["x", "y"], column: Column, rows: pd.DataFrame, few: bool | None = None
 ) -> None:
-    """Set the scale of an axis by its values in ``rows``, with a label at each if they are ``few``.
+    """Set the scale of an axis by its values in ``rows``, with a label at each if they are ``few``; None: what is drawn.
 
-    The area above 1 is shaded where that means something.
+    Marks among the drawn values are in view, and the area above 1 is shaded where that means something.
     """
     axis, values = panel.xaxis if which == "x" else panel.yaxis, rows[column.name]
     if not pd.api.types.is_numeric_dtype(values):
         axis.set_tick_params(rotation=30)
         return
     places = np.unique(values[np.isfinite(values)])
-    if _is_log(column, values):
-        low, high = _log_range(column, rows, [mark for mark in chart.marks if mark.axis == which])
+    if _is_log(column, values) and (few is None or (places > 0).all()):
+        low, high = _log_range(column, rows, [mark.at for mark in chart.marks if mark.axis == which and few is None])
         log_axis(
             panel, which, low, high, places if few and column.format == "setting" else (), _values_text(column, 0.0)
         )
@@ -241,7 +241,7 @@ def _scale(
         axis.set_major_formatter(lambda value, _: text(value))
 
 
-def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[Mark] = ()) -> tuple[float, float]:
+def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[float] = ()) -> tuple[float, float]:
     """Return the range of a logarithmic axis: all positive values, and their intervals within a factor of 100."""
     values = rows[column.name].clip(column.least, USELESS if column.above_one else None).to_numpy(float)
     values = values[np.isfinite(values) & (values > 0)]
@@ -250,7 +250,7 @@ def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[Mark] = ()) -
     low, high = float(values.min()), float(values.max())
     ends = rows[[name for name in (column.low, column.high) if name]].to_numpy(float).ravel()
     ends = ends[np.isfinite(ends) & (ends >= low / 100) & (ends <= (USELESS if column.above_one else high * 100))]
-    every = [low, high, *ends, *(mark.at for mark in marks)]
+    every = [low, high, *ends, *(at for at in marks if at > 0)]
     margin = max((max(every) / min(every)) ** 0.06, 1.15)
     return min(every) / margin, max(every) * margin
 

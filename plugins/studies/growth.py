@@ -30,7 +30,7 @@ of the log of a norm that a curve describes exactly."""
 STRONG = 20.0
 """Ratio of likelihoods from which one curve beats the other. By it, at most 5% of noisy power laws count as exploding."""
 FEWEST = 5
-"""Fewest horizons of a verdict: with four, 8% of noisy power laws count as exploding."""
+"""Fewest horizons that decide between the curves: with four, 8% of noisy power laws count as exploding."""
 
 QUANTILES = {"low": 0.05, "quarter": 0.25, "median": 0.5, "three_quarters": 0.75, "high": 0.95}
 """Quantiles over noise samples, stored for heavy-tailed quantities."""
@@ -64,7 +64,8 @@ VERDICT_NOTE = (
     "Median norms of one sample's gradient against the horizon, fitted by a power law and by an exponential. exploding: the "
     "exponential is at least 20 times as likely as the power law, and its rate is above 0. polynomial: the power law is as "
     "much more likely, or the more likely one where the Jacobian product does not grow, and its order is above 0. "
-    "growing: the order is above 0, by which curve is open. vanishing: the better curve falls by as much evidence. open: none of these. Intervals are of 95%. A variance is lower where the ranges over "
+    "growing: each norm is certainly above the one before, and the curve is open. vanishing: the better curve falls by as much "
+    "evidence. open: none of these. Intervals are of 95%. A variance is lower where the ranges over "
     "repeats from 5% to 95% do not overlap: first at every horizon, zeroth from a horizon on, else open."
 )
 NOTE = (
@@ -250,14 +251,17 @@ def fit(horizons: np.ndarray, norms: np.ndarray, errors: np.ndarray, bounded: bo
     """
     places, logarithms, errors = (np.log(horizons), horizons), np.log(norms), np.maximum(errors, ROUNDING)
     (*order, power), (*rate, exponential) = (_slope(at, logarithms, errors) for at in places)
-    odds = (power / exponential) ** (len(norms) / 2) if len(norms) >= FEWEST else math.nan
+    count, rises = len(norms), np.diff(logarithms) > 1.96 * np.hypot(errors[:-1], errors[1:])
+    odds = (power / exponential) ** (count / 2) if count >= FEWEST else math.nan
     verdict = "open"
     if odds >= STRONG and rate[1] > 0:
         verdict = "exploding"
     elif (odds >= STRONG and rate[2] < 0) or (odds <= 1 / STRONG and order[2] < 0):
         verdict = "vanishing"
-    elif order[1] > 0:
-        verdict = "polynomial" if odds <= 1 / STRONG or (odds <= 1 and bounded) else "growing"
+    elif order[1] > 0 and (odds <= 1 / STRONG or (odds <= 1 and bounded)):
+        verdict = "polynomial"
+    elif count > 2 and rises.all() and (np.diff(horizons) > 0).all():
+        verdict = "growing"
     return {"verdict": verdict, "odds": odds, **ends("order", order), **ends("rate", rate)}
 
 

@@ -10,6 +10,7 @@ import bench
 from bench import UserError
 from bench.model import (
     LoopOps,
+    MechanicalScene,
     State,
     ZeroOrderHoldScene,
     adjoint_gradient,
@@ -105,3 +106,32 @@ def test_a_feedback_law_cannot_be_held():
 
         class Closed(ZeroOrderHoldScene):
             n_q = 1
+
+
+@dataclass(frozen=True)
+class Steady(MechanicalScene):
+    """A cart with one control for all steps."""
+
+    name = "steady_cart"
+    n_q: ClassVar[int] = 1
+    n_u: ClassVar[int] = 2
+    noise: str = param("action", "what the noise perturbs", choices=("action",))
+    horizon: int = param(6, "steps", positive=True)
+    hold = 1
+    initial_state, acceleration = Cart.initial_state, Cart.acceleration
+    stage_cost, terminal_cost = Cart.stage_cost, Cart.terminal_cost
+
+    def theta0(self):
+        return np.array([0.5, 1.5])
+
+    def planned_controls(self, xp, theta):
+        return theta[None]
+
+
+def test_the_controls_of_one_step_stand_for_all():
+    w = np.random.default_rng(0).standard_normal((12, 5))
+    steady, each = compiled(Steady()), compiled(Cart())
+    theta = Steady().theta0()
+    np.testing.assert_array_equal(steady.value(theta, w), each.value(np.tile(theta, 6), w))
+    score = each.score(np.tile(theta, 6), w).reshape(6, 2, 5).sum(axis=0)
+    np.testing.assert_allclose(steady.score(theta, w), score, rtol=1e-6)

@@ -35,7 +35,7 @@ from PIL import Image
 
 from bench.experiment.axes import axes
 from bench.experiment.columns import Column, text
-from bench.experiment.views import Chart, Views
+from bench.experiment.views import Chart, Mark, Views
 from bench.report import latex, views, writer
 from bench.report.draw import NARROW, WIDTH, draw
 from bench.report.figures import DPI, save, styled
@@ -186,6 +186,14 @@ def test_an_interval_without_an_end_reaches_the_edge():
     low, high = panel.get_xlim()
     bars = panel.collections[0].get_segments()
     assert [(start < low, end > high) for (start, _), (end, _) in bars] == [(True, True), (False, True), (False, True)]
+
+
+@pytest.mark.parametrize("at", [0.0, -1.0, 1e9])
+def test_a_named_value_of_x_does_not_decide_its_range(at):
+    frame = pd.DataFrame({"x": [1.0, 10.0, 100.0], "y": [1.0, 2.0, 3.0]})
+    columns = [Column("x", log=True)], [Column("y", log=True)]
+    plain, marked = (figure_of(Chart("one", frame, *columns, marks=marks)) for marks in ([], [Mark("limit", at)]))
+    assert marked.axes[0].get_xlim() == plain.axes[0].get_xlim()
 
 
 LIMITED = {"kind": "grid", "level": "level", "limit": "limit", "limit_name": "edge", "failed_name": "not run"}

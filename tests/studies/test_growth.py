@@ -84,6 +84,8 @@ QUIET = np.full(5, 1e-3)
         (np.exp(-TIMES), "vanishing"),
         (TIMES**-2, "vanishing"),
         (TIMES[:4], "growing"),
+        (np.exp(TIMES[:3]), "growing"),
+        (np.array([1.0, 100.0, 99.0, 100.0, 101.0]), "open"),
         (np.ones(5), "open"),
         (np.array([1.0, 100.0, 1.0, 100.0, 1.0]), "open"),
     ],
@@ -96,7 +98,7 @@ def test_verdicts_of_planted_norms(norms, verdict):
 @pytest.mark.parametrize(
     ("horizons", "norms", "errors"),
     [
-        (TIMES[:3], np.exp(TIMES[:3]), QUIET[:3]),
+        (TIMES[:3], np.exp(0.1 * TIMES[:3]), 1e2 * QUIET[:3]),
         (TIMES[:1], np.ones(1), QUIET[:1]),
         (np.ones(5), np.exp(TIMES), QUIET),  # equal horizons, such as seeds
         (TIMES, np.exp(0.3 * TIMES), 1e3 * QUIET),  # norms known within a factor of e

@@ -162,6 +162,11 @@ def _along(
     )  # fmt: skip
 
 
+def _is_named(found: pd.Series, names: Sequence[Any]) -> pd.Series:
+    """Return whether each value is among the names, by itself or without its parameters."""
+    return found.isin(names) | found.astype(str).str.partition("[")[0].isin(names)
+
+
 def _lines(problem: ProblemRows, compared: str, names: Sequence[str]) -> pd.DataFrame:
     """Return the points of a problem: a line per estimator and backend, or per ``compared`` column in a panel per estimator.
 
@@ -170,7 +175,7 @@ def _lines(problem: ProblemRows, compared: str, names: Sequence[str]) -> pd.Data
     curves = estimator_curves(problem.rows, None if compared == "backend" else 0.03).assign(problem=problem.title())
     if compared:
         others = joined({**problem.identity, compared: ""})
-        curves = curves[[bool({name, name.partition("[")[0]} & {*names}) for name in curves[compared]]]
+        curves = curves[_is_named(curves[compared], names)]
         # a law has its own backends, which decide its times
         backends = " on " + curves["backend"] if compared == "contact" else ""
         return curves.assign(
@@ -224,7 +229,7 @@ def _error_and_time(shown: Arranged, subtitle: str) -> Chart | None:
         column = axis.column if axis else {"estimators": "series"}.get(name, name.removesuffix("s"))
         if column not in rows:
             raise unknown("axis in compares", name, (*shown.numbers, "estimators", "backends", "contacts"))
-        rows = rows[rows[column].isin(values)]
+        rows = rows[_is_named(rows[column], values)]
         along, ends = (axis, list(values)) if len(values) == 2 and axis else (along, ends)
     if rows.empty or (along is None and shown.swept()):
         return None

@@ -111,8 +111,8 @@ def has_law(rows: pd.DataFrame) -> pd.Series:
 
 
 def declares(rows: pd.DataFrame, fact: str) -> pd.Series:
-    """Return whether the estimator of each row declares a fact, such as ``fixed_work``."""
-    names = {name for name, entry in registry.entries()["estimators"].items() if entry.available}
+    """Return whether the estimator of each row, with its defaults, declares a fact, such as ``fixed_work``."""
+    names = {name for name, entry in registry.entries()["estimators"].items() if entry.plugin}
     declared = {
         name: bool(getattr(registry.make("estimators", name), fact, False)) for name in names & {*rows["estimator"]}
     }

@@ -78,7 +78,7 @@ WINDOW_NOTE = (
 FAULT_NOTE = "update: where it starts. value:"
 VERDICTS = (
     "settings: how many of the trainer were tried. The best on the first third of the seeds (the choosing seeds, of which those count "
-    "that all its settings have) is chosen, the other "
+    "that all its settings have, if any) is chosen, the other "
     "seeds are reported; of fewer than 8 seeds all are reported, and choose. "
     "verdict: first, tied (not distinguishable), behind (by a Mann-Whitney test at 5%), not chosen, or open: none is behind, or only "
     "the first's larger number of settings puts it ahead (it would lead with the worst of as many settings). not run: chosen, but "
@@ -169,12 +169,13 @@ def split(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
 def tried(lines: pd.DataFrame, tuning: pd.DataFrame) -> pd.DataFrame:
     """Return lines of :func:`summarise` with each trainer's number of ``settings``, and ``tuned``: the return that chooses one.
 
-    The settings of a trainer are compared on the seeds that all of them have. A setting that has only the seeds that choose is a
+    The settings of a trainer are compared on the seeds that all of them have, if there are any. A setting that has only the seeds that choose is a
     line without a ``final`` return.
     """
     keys = ["problem", "family", "method"]
     methods = tuning.groupby(keys[:2])["method"]
     has_all = tuning.groupby([*keys[:2], "seed"])["method"].transform("nunique") == methods.transform("nunique")
+    has_all |= ~has_all.groupby([tuning[key] for key in keys[:2]]).transform("any")
     middles = [(*key, interquartile_mean(final_returns(part))) for key, part in tuning[has_all].groupby(keys)]
     lines = lines.merge(pd.DataFrame(middles, columns=[*keys, "tuned"]), how="outer", on=keys)
     lines["settings"] = lines.groupby(keys[:2])["method"].transform("size")
