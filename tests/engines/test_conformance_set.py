@@ -459,15 +459,8 @@ def test_two_releases_have_a_folder_that_settings_can_name(tmp_path, monkeypatch
 
 @pytest.mark.slow
 def test_the_table_has_versions_digits_and_commands(tmp_path):
-    settings = [
-        "scenes=[bounce_once]",
-        "contacts=[penalty]",
-        "samples=2",
-        "repeats=2",
-        "reference.samples=256",
-        "workers=0",
-    ]
-    assert main(["engines", "table", "mujoco", f"out={tmp_path}", *settings]) == 0
+    settings = "scenes=[bounce_once] contacts=[penalty] samples=2 repeats=2 reference.samples=256 workers=0"
+    assert main(["engines", "table", "mujoco", f"out={tmp_path}", *settings.split()]) == 0
     page = (tmp_path / "engines.md").read_text()
     assert "| mujoco | mujoco 3." in page
     assert "`python -m bench engines table mujoco`" in page
