@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,31 +18,32 @@ from bench.gradient import Check, Part, roughness
 from bench.gradient.direction import CHANCE
 from bench.gradient.rules import SUSPICIOUS, UNEQUAL
 from bench.gradient.smooth_part import COSTS, SmoothPart, smooth_part
-from bench.simulator.simulator import Simulator
 
 NEAR = 0.05
 """Largest relative error of a gradient that small jumps may explain."""
-FAR, FAR_JUMPS = 0.25, 0.5
-"""Largest relative error that larger jumps may explain, and their largest total height, as a share of the cost's change."""
-EXPLAINED = 30.0
-"""Largest error of a gradient on a line, in multiples of the jumps' total height over the length of the line. An adjoint that is
-solved separately reaches 25, since only the six largest jumps of a line are known."""
-SMALL_JUMPS = 0.05
-"""Largest total height of such jumps, as a share of the cost's change along the line."""
-FEWEST_JUMPS = 2
-"""Fewest jumps on the lines that count as jumps of adaptive steps."""
-SPREADS = (0.0, 0.05, 0.1, 0.2, 0.4)
+EXPLAINED, EXPLAINED_IF_SHARED = 25.0, 100.0
+"""Largest error of a slope that adaptive steps explain, in multiples of the slopes of the breaks on a line: the heights of its
+jumps over its length, and its kinks' changes of slope. Of right gradients it reaches 22, since only six breaks of a line are known,
+and more where a solver's error is smooth: then it is small, and all slopes have a share of it."""
+FEWEST_BREAKS = 3
+"""Fewest breaks on all lines that bound such a small error."""
+LARGE, SHARED = 0.1, 0.01
+"""Least slope of a component, relative to the largest, that has a share of such an error, and its least share. A wrong input
+spoils only its own slope."""
+MOST_OF_CHANGE = 0.5
+"""Largest height of all jumps, as a share of the cost's change along a line, that adaptive steps make."""
+SPREADS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8, 0.8)
 """Distances from theta, in units of each input's scale, at which the loops of the program are compared."""
 ELSEWHERE, AROUND = 2, 0.05
 """Number of other thetas at which the gradient is compared with a refined cost, and their distance in units of the scales."""
 ALONG = 4
 """Random directions of these comparisons at each theta, beside the components."""
-LONGER = 10.0
-"""Length of the line on which more jumps are searched, in multiples of the first line."""
+LONG = 0.4
+"""Distance from theta of the ends of the line on which more breaks are searched, in units of the scales."""
 DIFFERENCED, SAME = 4, 1e-3
 """Most components at which differences are compared with a wrong gradient, and the largest part of its error that is left."""
 DIFFERENCE_STEPS = 10.0 ** -np.arange(1.0, 9.0)
-"""Steps of these differences."""
+"""Steps of these differences, in units of max(1, |x|)."""
 BESIDE, MOST_ROWS = 1e-3, 64
 """Spacing of the thetas at which the noise of a gradient is measured, in units of each input's scale, and most numbers of it."""
 LOOSE, MOST_OF_IT, REFINED = 0.01, 0.6, 10.0
@@ -70,6 +71,15 @@ class Horizon(NamedTuple):
         return self.error > tolerance + 2.0 * self.uncertainty
 
 
+class RefinedSlopes(NamedTuple):
+    """The slopes that gradient, cost and refined cost have at each theta, the given theta first: changes over the scale of an input."""
+
+    components: np.ndarray
+    """Along the checked components, ``(1 + ELSEWHERE, 3, m)``."""
+    directions: np.ndarray
+    """Along random directions of all inputs, since a wrong input may be none of the components."""
+
+
 @dataclass
 class Explanation:
     """What comparisons say about a wrong gradient."""
@@ -83,12 +93,11 @@ class Explanation:
     smooth_parts: Mapping[str, SmoothPart | None] = field(default_factory=dict)
     """By the name of a part whose differences disagree with the gradient, or hardly agree: the slope of a rough cost's smooth
     part; None where the cost is not rough."""
-    refined: np.ndarray | None = None
-    """The slopes of :func:`refined_slopes`; None without a refined cost."""
+    refined: RefinedSlopes | None = None
     gradient_noise: float = 0.0
     """Noise of the gradient between neighbouring thetas, relative to its norm."""
     difference_step: str = ""
-    """The step at which a difference of the cost is the gradient, ``1e-4, forward``; empty without one."""
+    """The step at which a difference of the cost is the gradient, ``1e-04 max(1, |x|), forward``; empty without one."""
 
     @property
     def wide(self) -> list[SmoothPart]:
@@ -96,19 +105,13 @@ class Explanation:
         return [one for one in self.smooth_parts.values() if one is not None]
 
 
-def refined_slopes(stages: GradientStages, other: Simulator) -> np.ndarray:
-    """Return by theta the slopes that gradient, cost and refined cost have, ``(1 + ELSEWHERE, 3, m)``, theta first.
-
-    They are along the checked components, and then along random directions of all inputs. A slope is the change over the
-    scale of an input.
-    """
-    index = [part.component or 0 for part in stages.check.components]
+def refined_slopes(stages: GradientStages, refined: Callable[..., Any]) -> RefinedSlopes:
+    """Return the slopes of gradient, cost and refined cost at theta and :data:`ELSEWHERE`."""
+    other = stages.simulator.variant(refined)
     random, eps = np.random.default_rng([stages.seed, 0x676170]), float(np.cbrt(stages.simulator.unit))
-    vectors = np.zeros((stages.theta.size, len(index) + min(ALONG, stages.theta.size)))
-    vectors[index, np.arange(len(index))] = 1.0
-    around = random.standard_normal(vectors[:, len(index) :].shape)
-    vectors[:, len(index) :] = around / np.linalg.norm(around, axis=0)
-    vectors *= stages.scale[:, None]
+    components = np.stack([_unit_vector(stages, part) for part in stages.check.components], axis=1)
+    around = random.standard_normal((stages.theta.size, min(ALONG, stages.theta.size)))
+    vectors = stages.scale[:, None] * np.hstack([components, around / np.linalg.norm(around, axis=0)])
     rows = []
     for spread in (0.0, *[AROUND] * ELSEWHERE):
         theta = stages.theta + spread * stages.scale * random.standard_normal(stages.theta.size)
@@ -116,8 +119,8 @@ def refined_slopes(stages: GradientStages, other: Simulator) -> np.ndarray:
             stages.differences(theta, vectors, step, one)
             for step, one in ((eps, stages.simulator), (REFINED * eps, other))
         )
-        rows.append([stages.gradient_at(theta) @ vectors, own, exact])
-    return np.array(rows)
+        rows.append([stages.gradients(theta[:, None])[:, 0] @ vectors, own, exact])
+    return RefinedSlopes(*np.split(np.array(rows), [components.shape[1]], axis=2))
 
 
 def changing_steps(stages: GradientStages) -> str:
@@ -135,10 +138,7 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
         other = simulator.with_steps(steps)
         gradient = other.gradients(stages.theta[:, None], stages.w)[:, 0]
         space = choose(stages.layout, stages.scale, gradient, stages.seed, most=4)
-
-        def costs(thetas: np.ndarray, other: Simulator = other) -> np.ndarray:
-            return other.costs(thetas, stages.same_noise(thetas.shape[1]))
-
+        costs = partial(stages.costs, simulator=other)
         quick = FewSteps(
             space, costs, gradient, float(costs(stages.theta[:, None])[0]), simulator.unit, stages.repeats.spread
         )
@@ -171,17 +171,11 @@ def doubtful(parts: Iterable[Part], groups: Collection[str]) -> list[Part]:
 def smooth_parts(stages: GradientStages, outcome: Check) -> dict[str, SmoothPart | None]:
     """Return by name the slope of a rough cost's smooth part, for the doubtful parts that the budget allows."""
     random, found = np.random.default_rng([stages.seed, 0x776964]), dict[str, SmoothPart | None]()
-    groups = {group.name: group for group in stages.groups}
-    for part in doubtful(outcome.parts, groups):
+    for part in doubtful(outcome.parts, stages.groups):
         if list(found.values()).count(None) == SMOOTH:
             found[part.name] = None
         elif stages.clock.can_afford(COSTS, share=MOST_OF_IT):
-            direction, group = np.zeros(stages.theta.size), groups.get(part.name)
-            if group is None:
-                direction[part.component or 0] = 1.0
-            else:
-                direction[group.first : group.last] = group.vector
-            along = partial(stages.costs_along, direction)
+            along = partial(stages.costs_along, _unit_vector(stages, part))
             found[part.name] = smooth_part(along, part.sample.scale, stages.simulator.unit, random)
     return found
 
@@ -192,14 +186,14 @@ def noise_of_gradient(stages: GradientStages) -> float:
     random = np.random.default_rng([stages.seed, 0x6E6F6973])
     along = BESIDE * stages.scale * random.standard_normal(stages.theta.size)
     thetas = stages.theta[:, None] + along[:, None] * np.arange(roughness.POINTS)
-    gradients = np.stack([stages.gradient_at(theta) for theta in thetas.T], axis=1)
-    noise = [roughness.noise(row[None]) for row in gradients[:MOST_ROWS]]
-    return float(np.linalg.norm(noise) / np.linalg.norm(gradients[:MOST_ROWS, 0]))
+    gradients = stages.gradients(thetas)[:MOST_ROWS]
+    noise = [roughness.noise(row[None]) for row in gradients]
+    return float(np.linalg.norm(noise) / np.linalg.norm(gradients[:, 0]))
 
 
 @np.errstate(all="ignore")
 def step_of_difference(stages: GradientStages, outcome: Check) -> str:
-    """Return the step at which a difference of the cost is the wrong gradient, ``1e-4, forward``; empty where none is.
+    """Return the step at which a difference of the cost is the wrong gradient, ``1e-04 max(1, |x|), forward``; empty where none is.
 
     A gradient by differences with too long or too short a step is off by the error of that step.
     """
@@ -209,17 +203,15 @@ def step_of_difference(stages: GradientStages, outcome: Check) -> str:
     program = np.array([part.program for part in wrong])
     allowed = SAME * np.abs(program - [part.difference for part in wrong])
     index = [part.component or 0 for part in wrong]
-    at = np.abs(stages.theta[index])
-    for size, units in (("", np.ones_like(at)), (" max(1, |x|)", np.maximum(at, 1.0)), (" |x|", at)):
-        steps = units[:, None] * DIFFERENCE_STEPS
-        moved = np.zeros((stages.theta.size, 2, *steps.shape))
-        moved[index, :, np.arange(len(index))] = np.stack([-steps, steps], axis=1)
-        thetas = stages.theta[:, None] + moved.reshape(stages.theta.size, -1)
-        minus, plus = stages.costs(thetas).reshape(2, *steps.shape)
-        for name, slopes in (("forward", (plus - stages.value) / steps), ("central", (plus - minus) / (2 * steps))):
-            is_same = (np.abs(slopes - program[:, None]) <= allowed[:, None]).all(axis=0)
-            if is_same.any():
-                return f"{DIFFERENCE_STEPS[int(np.argmax(is_same))]:.0e}{size}, {name}"
+    steps = np.maximum(np.abs(stages.theta[index, None]), 1.0) * DIFFERENCE_STEPS
+    moved = np.zeros((stages.theta.size, 2, *steps.shape))
+    moved[index, :, np.arange(len(index))] = np.stack([-steps, steps], axis=1)
+    thetas = stages.theta[:, None] + moved.reshape(stages.theta.size, -1)
+    minus, plus = stages.costs(thetas).reshape(moved.shape[1:])
+    for name, slopes in (("forward", (plus - stages.value) / steps), ("central", (plus - minus) / (2 * steps))):
+        is_same = (np.abs(slopes - program[:, None]) <= allowed[:, None]).all(axis=0)
+        if is_same.any():
+            return f"{DIFFERENCE_STEPS[int(np.argmax(is_same))]:.0e} max(1, |x|), {name}"
     return ""
 
 
@@ -238,14 +230,14 @@ def relative_error(outcome: Check) -> float:
 
     A discretisation changes all components by an amount of one size, which is large beside a small component.
     """
-    parts = [part for part in outcome.parts if np.isfinite([part.program, part.difference]).all()]
-    single = [(p.program, p.difference, p.sample.scale) for p in parts if p.component is not None]
-    program, differences, scale = np.array(single).reshape(-1, 3).T
-    size = float(np.linalg.norm(differences * scale))
-    errors = [(float(np.linalg.norm(program * scale - differences * scale)), size)]
-    # a group or a direction has length 1 in these units
-    errors += [(abs(p.program - p.difference), max(abs(p.difference), size)) for p in parts if p.component is None]
-    return max(error / size if size > 0 else float("inf") for error, size in errors)
+    errors, slopes = _in_scales(outcome.parts)
+    return float(np.linalg.norm(errors) / np.linalg.norm(slopes))
+
+
+def _in_scales(parts: Iterable[Part]) -> np.ndarray:
+    """Return sizes of errors and of differences in units of the scales, ``(2, n)``; a group or a direction has length 1 in these."""
+    rows = [np.abs([p.program - p.difference, p.difference]) * p.sample.scale for p in parts]
+    return np.array([row for row in rows if np.isfinite(row).all()]).reshape(-1, 2).T
 
 
 def may_be_adaptive(outcome: Check) -> bool:
@@ -256,34 +248,54 @@ def may_be_adaptive(outcome: Check) -> bool:
 def is_adaptive(
     stages: GradientStages, outcome: Check, lines: Sequence[LineScan], effort: tuple[int, int, int]
 ) -> bool:
-    """Return whether the jumps of the cost explain the error of the gradient, as with adaptive steps.
+    """Return whether the breaks of the cost explain the error of the gradient, as with adaptive steps.
 
-    A solver with adaptive steps has another discretisation error on either side of each change of its number of steps.
-    Its cost has a small jump there, and slopes between jumps that differ from the solution's slopes by about the height
-    of a jump over the distance between jumps. Reverse mode through such a solver holds the steps fixed, and an adjoint
-    that is solved separately has steps of its own, so these gradients differ by as much. Where few jumps are found
-    beside a small error, a line ten times as long is searched, as :func:`scan` does with ``effort``. A larger error
-    counts where the jumps on the first lines change the cost by more than the error does.
+    A solver with adaptive steps has another discretisation error on either side of each change of its sequence of steps: its
+    cost jumps where a step is rejected, and has a kink where a limit of the steps' sizes is met. Slopes between breaks differ
+    from the solution's slopes by about as much as breaks change them. Reverse mode holds the steps fixed, and sensitivities
+    or an adjoint have steps of their own, so these gradients differ from differences by as much. Where the lines at theta show
+    less, a long line along the error is searched, as :func:`scan` does with ``effort``.
     """
-    lines = [line for line in lines if np.isfinite(line.costs).all()]
-    error = relative_error(outcome)
-    if stages.gradient is None or not lines or error > FAR:
+    error = _error_vector(stages, outcome)
+    size = float(np.linalg.norm(error / stages.scale))
+    if not 0.0 < size < np.inf:
         return False
+    if any(size <= EXPLAINED * _slope_of_breaks(line, stages.scale) for line in lines):
+        return True
+    direction, noise = error / size, max(outcome.noise, stages.repeats.spread)
+    line = scan(partial(stages.costs_along, direction), direction, noise, LONG, effort, stages.simulator.unit)
+    lines = [*lines, line]
+    slope = max(_slope_of_breaks(one, stages.scale) for one in lines)
+    errors, slopes = _in_scales(outcome.components)
+    is_shared = (errors >= SHARED * size)[slopes >= LARGE * slopes.max(initial=0.0)].all()
+    is_bounded = size > EXPLAINED_IF_SHARED * slope and sum(len(one.breaks) for one in lines) >= FEWEST_BREAKS
+    return size <= EXPLAINED * slope or bool(is_shared and relative_error(outcome) <= NEAR and not is_bounded)
 
-    if sum(len(line.jumps) for line in lines) < FEWEST_JUMPS and error <= NEAR:
-        first, noise = lines[0], max(outcome.noise, stages.repeats.spread)
-        reach, unit = LONGER * float(first.at[-1]), stages.simulator.unit
-        cost = partial(stages.costs_along, first.direction)
-        lines = [scan(cost, first.direction, noise, reach, effort, unit)]
-    if sum(len(line.jumps) for line in lines) < FEWEST_JUMPS:
-        return False
-    rows = []
-    for line in lines:
-        step = 1e-3 * float(line.at[1] - line.at[0])
-        slope = stages.differences(stages.theta, line.direction[:, None], step)
-        apart = abs(float(slope[0] - line.direction @ stages.gradient))
-        rows.append((sum(jump.size for jump in line.jumps), np.abs(np.diff(line.costs)).sum(), apart * np.ptp(line.at)))
-    heights, changes, errors = np.array(rows).T
-    is_near = error <= NEAR and ((heights < SMALL_JUMPS * changes) & (errors <= EXPLAINED * heights)).any()
-    is_far = heights.sum() < FAR_JUMPS * changes.sum() and (errors <= heights).all()
-    return bool(is_near or is_far)
+
+def _error_vector(stages: GradientStages, outcome: Check) -> np.ndarray:
+    """Return the displacement ``(d,)`` along which the gradient is most wrong, whose length in the scales is the error there."""
+    parts = [part for part in outcome.parts if part.component is not None or part.name in stages.groups]
+    errors = ((p.program - p.difference) * p.sample.scale**2 * _unit_vector(stages, p) for p in parts)
+    return sum(errors, np.zeros(stages.theta.size))
+
+
+def _unit_vector(stages: GradientStages, part: Part) -> np.ndarray:
+    """Return the change of theta ``(d,)`` where the coordinate of a component or group changes by 1."""
+    vector = np.zeros(stages.theta.size)
+    if part.component is not None:
+        vector[part.component] = 1.0
+    else:
+        group = stages.groups[part.name]
+        vector[group.first : group.last] = group.vector
+    return vector
+
+
+def _slope_of_breaks(line: LineScan, scale: np.ndarray) -> float:
+    """Return the sum of jumps over the length of a line, and of its kinks' changes of slope, per unit of the scales; 0 where
+    jumps make up the cost.
+    """
+    heights = sum(jump.size for jump in line.jumps)
+    if not heights <= MOST_OF_CHANGE * np.abs(np.diff(line.costs)).sum():
+        return 0.0
+    bends = sum(one.size for one in line.breaks if one.kind == "kink")
+    return float((heights / np.ptp(line.at) + bends) / np.linalg.norm(line.direction / scale))

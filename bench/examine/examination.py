@@ -44,8 +44,8 @@ NODES = (28, 48)
 """Points of the two integrals of the gradient along a line, by Gauss-Legendre."""
 LEAST_MISSED = 0.002
 """Largest error of the integral of the gradient, as a share of the cost's change, that is always accepted."""
-LINE_EFFORTS = ((PLACES, HALVINGS), (3, 10), (1, 10))
-"""Places searched on a line and halvings of each, from the full search to the smallest."""
+LINE_EFFORTS = ((POINTS, HALVINGS, PLACES), (49, 10, 3), (17, 10, 1))
+"""Points of a line, halvings of the interval of a break, and places searched, from the full search to the smallest."""
 MEANS_SHARE = 0.4
 """Share of the remaining budget for the mean of a gradient over draws of the simulator's own noise."""
 OWN_LEVELS, OWN_SHARE, OWN_DRAWS = (0.01, 0.03, 0.1, 0.3, 1.0), 0.6, 64
@@ -53,10 +53,6 @@ OWN_LEVELS, OWN_SHARE, OWN_DRAWS = (0.01, 0.03, 0.1, 0.3, 1.0), 0.6, 64
 its own standard deviation in this number of draws."""
 EARLY_SHARE = 0.5
 """Share of the remaining budget for the lines of a gradient that adaptive steps may explain."""
-SIDES_OF_A_BREAK = 2 * SIDES
-"""Costs that confirm a break."""
-FEWEST_POINTS = 17
-"""Fewest points of a line scan."""
 HELD = 20_000_000
 """Most numbers in the thetas of the pairs of one sigma, since memory stores several copies."""
 KEY, WORDS_OF_A_KEY = "key", 2
@@ -254,7 +250,7 @@ class _Examination:
         has_gradient = stages.gradient is not None
         self._find_smooth_parts(checked)
         if refined is not None and has_gradient and (is_wrong or explained.wide):
-            self._compare_refined(refined)
+            self._explain("refined", "the refined cost", diagnosis.refined_slopes, refined)
         if setup.horizons:
             self._explain("growth", "horizons", diagnosis.errors_by_horizon, setup.horizons)
         if is_wrong and has_gradient:
@@ -306,7 +302,7 @@ class _Examination:
         """Return the numbers of costs and gradients with which nothing is left out, as far as is known."""
         n_sigmas, (costs, gradients) = len(self.setup.levels) or bool(self.simulator.noise), self.stages.enough()
         lines = len(directions(2, self.setup.scale, 0))
-        costs += 2 * lines * (POINTS + PLACES * (2 * HALVINGS + SIDES_OF_A_BREAK)) + n_sigmas * 2 * FIRM
+        costs += 2 * lines * (POINTS + PLACES * (2 * HALVINGS + 2 * SIDES)) + n_sigmas * 2 * FIRM
         return costs, gradients + (lines * sum(NODES) + n_sigmas * 2 * FIRM) * self.simulator.has_gradient
 
     def _group_sizes(self) -> dict[str, GroupSize]:
@@ -314,12 +310,12 @@ class _Examination:
         gradient, setup, sizes = self.stages.gradient, self.setup, dict[str, GroupSize]()
         if gradient is None:
             return sizes
-        for group in self.stages.groups:
+        for name, group in self.stages.groups.items():
             part = slice(group.first, group.last)
             slope, scale = np.abs(gradient[part]), setup.scale[part]
             per_input = setup.tolerated(part, slope), slope
             allowed, whole = (float(np.linalg.norm(scale * each)) for each in per_input)
-            sizes[group.name] = GroupSize(slope.size, allowed, whole)
+            sizes[name] = GroupSize(slope.size, allowed, whole)
         return sizes
 
     def _attempt(self, what: str, function: Callable[[], Any], share: float = 1.0) -> Any:
@@ -333,12 +329,6 @@ class _Examination:
         found = self._attempt(what, partial(function, self.stages, *given))
         if found is not None:
             setattr(self.explained, name, found)
-
-    def _compare_refined(self, refined: Any) -> None:
-        """Compare gradient and cost with a refined cost, whose program is compiled once."""
-        other = self._attempt("the refined cost", lambda: self.simulator.variant(refined))
-        if other is not None:
-            self._explain("refined", "the refined cost", diagnosis.refined_slopes, other)
 
     # ------------------------------------------------------------------------------------------------ lines
 
@@ -369,17 +359,16 @@ class _Examination:
         if not self.explained.steps:
             return None if self.explained.steps is None else False
         near = self._scan_near(checked, share)
-        effort = self._effort(self.clock.affordable(0.9))
+        effort = self._effort(0.9)
         decide = partial(diagnosis.is_adaptive, self.stages, checked, near, effort)
         return self._attempt("the comparison along lines", decide) if near and effort[0] else None
 
-    @staticmethod
-    def _effort(room: float) -> tuple[int, int, int]:
-        """Return points, halvings and places of a line scan with at most ``room`` costs; no points if these are too few."""
-        for most, halvings in LINE_EFFORTS:
-            points = int(min(POINTS, room - most * (2 * halvings + SIDES_OF_A_BREAK)))
-            if points >= FEWEST_POINTS:
-                return points, halvings, most
+    def _effort(self, share: float) -> tuple[int, int, int]:
+        """Return the largest of :data:`LINE_EFFORTS` that fits a share of the remaining budget; zeros where none does."""
+        for effort in LINE_EFFORTS:
+            points, halvings, most = effort
+            if self.clock.can_afford(points + most * (2 * halvings + 2 * SIDES), share=share):
+                return effort
         return 0, 0, 0
 
     def _scan_lines(self, checked: Check) -> list[LineScan]:
@@ -399,7 +388,7 @@ class _Examination:
         They take at most ``share`` of the remaining budget.
         """
         along, unit, lines = directions(2, spread, self.setup.seed), self.simulator.unit, list[LineScan]()
-        effort = self._effort(self.clock.affordable(share) / len(along))
+        effort = self._effort(share / len(along))
         sizes = [checked.noise, self.stages.repeats.spread, unit * abs(self.stages.value)]
         rounding = float(np.nan_to_num(sizes, posinf=0.0).max())
         with self.clock.stage("jumps and kinks on lines", self.left_out, min(1.0, 2 * share)):

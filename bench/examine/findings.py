@@ -247,8 +247,9 @@ class Findings:
 
     @cached_property
     def judged(self) -> Check:
-        """The check with derivatives of a rough cost judged by its smooth part."""
-        if not self.explained.wide or self.tread or self._is_rough:
+        """The check with derivatives of a rough cost, or of one with adaptive steps, judged by its smooth part or a refined cost."""
+        has_smooth_part = self.explained.wide or (self.explained.steps and self._agrees_with_refined)
+        if not has_smooth_part or self.tread or self._is_rough:
             return self.check
         return recaused(self.check, self._of_smooth_part)
 
@@ -265,10 +266,16 @@ class Findings:
             for one in samples
         )
 
+    @property
+    def _is_averaged(self) -> bool:
+        """Whether wide steps meet several sequences of steps: the slope over them is another than at tiny steps."""
+        known = [(part, self.explained.smooth_parts.get(part.name)) for part in self.check.parts]
+        return any(wide and abs(wide.slope - part.difference) > wide.error + part.uncertainty for part, wide in known)
+
     @cached_property
     def _refined(self) -> dict[str, float]:
         """The refined cost's derivatives by component; empty without a refined cost."""
-        slopes = [] if self.explained.refined is None else self.explained.refined[0, 2]
+        slopes = self.explained.refined.components[0, 2] if self.explained.refined else []
         return {p.name: float(one) / p.sample.scale for p, one in zip(self.check.components, slopes, strict=False)}
 
     def _of_smooth_part(self, part: Part) -> Part:
@@ -428,7 +435,7 @@ class Findings:
         yield "staircase", is_suspicious and (self._is_on_tread or self.has_steps), numbers
         yield "rough", failed == "unsettled" and self._is_rough, ""
         yield "adaptive", failed == "unsettled" and bool(explained.wide), numbers
-        is_decided = bool(explained.wide) and explained.refined is not None
+        is_decided = bool(explained.wide) and (explained.refined is not None or self._is_averaged)
         is_gap = failed in EXCUSABLE and not is_decided and self.is_discretisation_gap
         loop = f", {explained.steps} has another length at other thetas" * bool(explained.steps)
         yield "adaptive", is_gap, f"{numbers}{loop}"
@@ -436,8 +443,10 @@ class Findings:
         yield "overwritten", is_grown and failed in (*UNEQUAL, "unsettled"), numbers
         is_falling = self.hint is not None and self.hint.cause == "continuous_adjoint"
         yield "continuous_adjoint", is_falling and is_suspicious, numbers
-        # so small an error that adaptive steps may explain it, and the budget ended before that was known
-        is_open = explained.is_adaptive is None and explained.refined is None and may_be_adaptive(self.check)
+        # adaptive steps may explain the error, and the budget ended before that was known
+        is_unknown = explained.is_adaptive is None and (bool(explained.steps) or may_be_adaptive(self.check))
+        unseen = {part.name for part in doubtful(self.check.parts, self.groups)} - {*explained.smooth_parts}
+        is_open = explained.refined is None and not is_decided and (is_unknown or bool(explained.steps and unseen))
         yield "undecided", is_open and is_suspicious, f"{numbers}: adaptive steps may explain it"
         yield "unresolved", is_suspicious and self._is_slight, numbers
         yield failed, True, numbers
@@ -610,15 +619,22 @@ class Findings:
         Either the gradient agrees with a refined cost where the cost's own differences do not, at every theta compared. Or
         the steps depend on theta, and the error is of the size of the jumps that this makes, or of a refined cost's gap.
         """
-        refined, is_varied = self.explained.refined, bool(self.explained.steps)
-        if refined is None:
+        is_varied = bool(self.explained.steps)
+        if self.explained.refined is None:
             return is_varied and bool(self.explained.is_adaptive)
-        # along the checked components and along random directions: a wrong input may be none of the former
-        parts = np.split(refined, [len(self.check.components)], axis=2)
-        gaps = [np.linalg.norm(slopes[:, :2] - slopes[:, 2:], axis=2).T for slopes in parts]
-        agrees = all((gradient <= AGREES * own).all() for gradient, own in gaps)
-        is_near = all(np.linalg.norm(gradient) <= AS_FAR * np.linalg.norm(own) for gradient, own in gaps)
-        return agrees or (is_varied and is_near)
+        is_near = all(np.linalg.norm(gradient) <= AS_FAR * np.linalg.norm(own) for gradient, own in self._gaps)
+        return self._agrees_with_refined or (is_varied and is_near)
+
+    @property
+    def _agrees_with_refined(self) -> bool:
+        """Whether the gradient agrees with a refined cost where the cost's own differences do not, at every theta compared."""
+        return bool(self._gaps) and all((gradient <= AGREES * own).all() for gradient, own in self._gaps)
+
+    @cached_property
+    def _gaps(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Distances by theta of gradient and of own differences from a refined cost: by component, and along random directions."""
+        gaps = [np.linalg.norm(slopes[:, :2] - slopes[:, 2:], axis=2).T for slopes in self.explained.refined or ()]
+        return [(gradient, own) for gradient, own in gaps]
 
     @property
     def derivative(self) -> str:
@@ -668,9 +684,13 @@ class Findings:
     @property
     def is_measured(self) -> bool:
         """Whether the bias of the mean gradient is decided at every sigma."""
-        return len(self.smoothed) >= max(len(self.setup.sigmas), 1) and all(
-            one.known and one.decided and math.isfinite(one.bias) for one in self.smoothed
-        )
+        is_whole = len(self.smoothed) >= len(self.setup.sigmas)
+        return is_whole and self._has_biases and all(one.decided for one in self.smoothed)
+
+    @property
+    def _has_biases(self) -> bool:
+        """Whether the bias of the mean gradient is known at the measured sigmas."""
+        return bool(self.smoothed) and all(math.isfinite(one.bias) and one.known for one in self.smoothed)
 
     @property
     def missed(self) -> float:
@@ -683,8 +703,7 @@ class Findings:
         # a part of the cost that is rounded everywhere is a fault of its own, however small
         if self.tread:
             return self.missed > SEEN and not self.is_measured
-        is_measured = bool(self.smoothed) and all(math.isfinite(one.bias) and one.known for one in self.smoothed)
-        return self.missed > TARGET_ERROR and not is_measured
+        return self.missed > TARGET_ERROR and not self._has_biases
 
     @property
     def has_steps(self) -> bool:
@@ -709,7 +728,7 @@ class Findings:
             return "not shown" if RULES[self.noise_cause].kind == "open" else "NOT usable"
         if self.noise_cause or not self.smoothed or any(one.cause for one in self.smoothed):
             return "not measured"
-        return "usable" if all(math.isfinite(one.bias) and one.known for one in self.smoothed) else "not shown"
+        return "usable" if self._has_biases else "not shown"
 
     # ----------------------------------------------------------------------------------------------------- both
 

@@ -56,13 +56,12 @@ def _explanations(
     """Yield causes of a wrong gradient ``program (n,)``, whether each fits, and its text, in the order in which they are tried."""
     inputs, ratios, error = at[wrong], (program / difference)[wrong], program - difference
     step, noise, growth = explained.difference_step, explained.gradient_noise, explained.growth
-    is_several, is_varied = is_whole and wrong.sum() > 1, np.unique(inputs).size > 1
+    is_several = is_whole and wrong.sum() > 1
     yield "wrong_adjoint", bool(step), f"it is a difference of the cost at a step of {step}"
     is_sorted = _are_equal(np.sort(program), np.sort(difference)) and not _are_equal(program, difference)
     yield "wrong_adjoint", is_several and is_sorted, "its numbers are the differences in another order"
-    is_log, is_inverse = _are_equal(ratios, inputs), _are_equal(ratios, 1.0 / inputs)
-    yield "wrong_adjoint", is_varied and is_log, "the ratios are the inputs, as of a gradient by their logarithms"
-    yield "wrong_adjoint", is_varied and is_inverse, "the ratios are 1 over the inputs"
+    is_log = np.unique(inputs).size > 1 and _are_equal(ratios, inputs)
+    yield "wrong_adjoint", is_log, "the ratios are the inputs, as of a gradient by their logarithms"
     sizes = float(np.linalg.norm(error) * np.linalg.norm(at))
     is_along = np.count_nonzero(at) > 1 and sizes > 0 and abs(float(error @ at)) > ALONG_THETA * sizes
     yield (

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -102,8 +103,8 @@ class GradientStages:
         """Checks under other draws of the simulator's own noise."""
         self.located: dict[str, tuple[int, int]] = {}
         """By name of a wrong group: the first of the numbers that cause its error, and the last + 1."""
-        self.groups: list[Group] = []
-        """The groups of a large theta that are checked along one direction each."""
+        self.groups: dict[str, Group] = {}
+        """By name: the groups of a large theta that are checked along one direction each."""
         self.left_out: list[str] = []
         self.repeats = Repeats(floor_of_gradient=simulator.unit**SMALL)
         self._repeated = False  # whether calls were repeated within the budget
@@ -112,9 +113,9 @@ class GradientStages:
 
     # ------------------------------------------------------------------------------------------------ calls
 
-    def costs(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
-        """Return the costs ``(B,)`` of ``thetas (d, B)``, all under the same draw of the simulator's own noise."""
-        return self.simulator.costs(thetas, self.same_noise(thetas.shape[1], w))
+    def costs(self, thetas: np.ndarray, w: np.ndarray | None = None, simulator: Simulator | None = None) -> np.ndarray:
+        """Return the costs ``(B,)`` of ``thetas (d, B)``, also of another simulator, all under the same draw of its own noise."""
+        return (simulator or self.simulator).costs(thetas, self.same_noise(thetas.shape[1], w))
 
     def same_noise(self, count: int, w: np.ndarray | None = None) -> np.ndarray | None:
         """Return a draw ``w (n, 1)`` of the simulator's own noise, by default the first, for each of ``count`` thetas."""
@@ -140,16 +141,12 @@ class GradientStages:
     ) -> np.ndarray:
         """Return central differences ``(m,)`` at ``theta (d,)`` along ``vectors (d, m)``, of the cost or of another simulator."""
         thetas = theta[:, None] + step * np.concatenate([vectors, -vectors], axis=1)
-        costs = (simulator or self.simulator).costs(thetas, self.same_noise(thetas.shape[1]))
+        costs = self.costs(thetas, simulator=simulator)
         return np.asarray(np.subtract(*np.split(costs, 2)) / (2.0 * step))
 
     def gradients(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
         """Return the simulator's gradients at ``thetas (d, B)``, all under the same draw of its own noise."""
         return self.simulator.gradients(thetas, self.same_noise(thetas.shape[1], w))
-
-    def gradient_at(self, theta: np.ndarray) -> np.ndarray:
-        """Return the simulator's gradient at ``theta (d,)``."""
-        return self.gradients(theta[:, None])[:, 0]
 
     def _costs_in(self, space: Subspace, w: np.ndarray | None, z: np.ndarray) -> np.ndarray:
         """Return the costs ``(B,)`` at coordinates ``z (m, B)``."""
@@ -184,14 +181,16 @@ class GradientStages:
             self._run_stages(explain)
 
     def repeat_failures(self) -> None:
-        """Repeat calls that raised an exception, which may do so at random."""
+        """Repeat calls that raised an exception, which may do so at random; the repeats do not count as further exceptions."""
+        counts = deepcopy(self.simulator.raised)
         with self.clock.stage("calls that raised an exception, once more", self.left_out):
             for kind, *parts in list(self.simulator.failed):
                 self.repeats.is_failing |= bool(np.isfinite(getattr(self.simulator, kind)(*parts)).any())
+        self.simulator.raised = counts
 
     def _run_stages(self, explain: Callable[[Check], None]) -> None:
         space = choose(self.layout, self.scale, self.gradient, self.seed)
-        self.groups = space.groups
+        self.groups = {group.name: group for group in space.groups}
         with self.clock.stage("the check at more than one step", self.left_out):
             for stage in (partial(self._compare_quickly, space), self._repeat):
                 stage()
@@ -213,7 +212,7 @@ class GradientStages:
         self.repeats.floor = simulator.unit**SMALL * (abs(self.value) if math.isfinite(self.value) else 0.0)
         if not simulator.has_gradient:
             return
-        gradient = self.gradient_at(self.theta)
+        gradient = self.gradients(self.theta[:, None])[:, 0]
         self.is_failed = bool(simulator.raised["gradients"])
         if not self.is_failed:
             self.gradient = gradient
@@ -372,11 +371,10 @@ class GradientStages:
         """Find the numbers that cause the error of each wrong group."""
         if self.gradient is None:
             return
-        groups = {group.name: group for group in space.groups}
         with self.clock.stage("the place of the error in its group", self.left_out):
             for part in self.check.parts:
-                if part.name in groups and part.verdict in FAULTS and math.isfinite(part.program):
-                    first, last = locate(groups[part.name], self.theta, self.gradient, self.costs, part)
+                if part.name in self.groups and part.verdict in FAULTS and math.isfinite(part.program):
+                    first, last = locate(self.groups[part.name], self.theta, self.gradient, self.costs, part)
                     self.located[part.name] = first, last
                     if last - first == 1 and first not in space.components:
                         self._check_number(first, part.verdict)
@@ -416,10 +414,13 @@ def _are_equal(values: np.ndarray) -> bool:
 
 def _with_zeros(outcome: Check) -> Check:
     """Return a check in which a derivative below the rounding of a cost that does not move is ``zero``."""
-    zeros = [p for p in outcome.parts if p.verdict in (*TRUSTED, "unsettled") and is_nothing(p.sample)]
-    if all(part.verdict == "zero" for part in zeros):
+
+    def is_zero(part: Part) -> bool:
+        return part.verdict in (*TRUSTED, "unsettled") and is_nothing(part.sample)
+
+    if all(part.verdict == "zero" for part in filter(is_zero, outcome.parts)):
         return outcome
-    return recaused(outcome, lambda part: replace(part, verdict="zero") if any(part is p for p in zeros) else part)
+    return recaused(outcome, lambda part: replace(part, verdict="zero") if is_zero(part) else part)
 
 
 def recaused(outcome: Check, replaced: Callable[[Part], Part] = lambda part: part) -> Check:

@@ -35,15 +35,18 @@ def changing_loop(simulator: Simulator, thetas: np.ndarray, w: np.ndarray | None
     place = _loop_of_jax(simulator, thetas[:, 0], w)
     if place or simulator.library == "jax":
         return place
-    runs = [rounds_of_loops(simulator, theta, w) for theta in thetas.T]
-    for file, line in sorted(set.intersection(*map(set, runs))):
+    runs = [rounds for rounds in (rounds_of_loops(simulator, theta, w) for theta in thetas.T) if rounds]
+    for file, line in sorted(set.intersection(*map(set, runs)) if runs else ()):
         if len({rounds[file, line] for rounds in runs}) > 1:
             return f"the loop at {Path(file).name}:{line}"
     return ""
 
 
 def rounds_of_loops(simulator: Simulator, theta: np.ndarray, w: np.ndarray | None) -> Counter[tuple[str, int]]:
-    """Return by file and line of a while loop how often its condition is computed by one call of the cost at ``theta (d,)``."""
+    """Return by file and line of a while loop how often its condition is computed by one call of the cost at ``theta (d,)``.
+
+    Empty where the cost is not a number, since its loops may have been cut off.
+    """
     rounds: Counter[tuple[str, int]] = Counter()
 
     def enter(frame: FrameType, event: str, argument: Any) -> Any:
@@ -57,8 +60,8 @@ def rounds_of_loops(simulator: Simulator, theta: np.ndarray, w: np.ndarray | Non
 
         return follow if lines else None
 
-    simulator.trace(enter, *(part for part in (theta[:, None], w) if part is not None))
-    return rounds
+    costs = simulator.trace(enter, *(part for part in (theta[:, None], w) if part is not None))
+    return rounds if np.isfinite(costs).all() else Counter()
 
 
 @cache

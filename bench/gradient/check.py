@@ -26,8 +26,6 @@ AGREES = 1e-3
 """Relative difference of the gradient from a tangent up to which they agree: on a chaotic rollout, both have errors."""
 MATTERS = 1e3
 """Change of the cost by a hundredth of a tiny input, in unit roundoffs, from which on the input's size is its scale."""
-SUSPICIOUS = 4
-"""Default of :attr:`Options.scanned`."""
 ELSEWHERE = 4
 """Most other thetas at which the ratio of a wrong component is computed."""
 LOOSE = 1e-3
@@ -60,7 +58,7 @@ class Options:
     """Declared unit roundoff of the arithmetic; the noise of the cost is measured in addition."""
     scale: np.ndarray | None = None
     """The scale of each input ``(d,)``; None uses :func:`scales`."""
-    scanned: int = SUSPICIOUS
+    scanned: int = 4
     """Most directions scanned for a staircase, at about 450 costs each."""
     repeated: bool = True
     """Whether every cost at theta is computed twice, which exposes costs that do not repeat."""

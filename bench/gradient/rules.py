@@ -185,8 +185,9 @@ EXAMINATION = {
     "adaptive": Rule(
         "open", "gradient and differences differ by as much as the discretisation does, as with adaptive steps: neither is "
         "exactly the derivative of the solution",
-        "`missing_term` or `wrong_adjoint` where a loop's length depends on theta, and jumps explain an error up to "
-        "{diagnosis.NEAR:.0%}, or {diagnosis.FAR:.0%} where they move the cost more than the error does. With `refined`: the gradient is at "
+        "`missing_term` or `wrong_adjoint` where a loop's length depends on theta, and the error is at most {diagnosis.EXPLAINED:g} times "
+        "the jumps and kinks of a line, as slopes over its length; or {diagnosis.EXPLAINED_IF_SHARED:g} times, or there are fewer than "
+        "{diagnosis.FEWEST_BREAKS}, where it is at most {diagnosis.NEAR:.0%} and every large slope has a share. With `refined`: the gradient is at "
         "most {findings.AGREES:g} times as far from it as the differences at each theta, or {findings.AS_FAR:g} times beside such a loop. "
         "Of a rough cost: no slope over wide steps is known to {smooth_part.LIMIT:.0%}",
         "give the cost at a tighter tolerance; accept it if the gradient is meant to be that one's", ("refined=COST", *EXPECTED),

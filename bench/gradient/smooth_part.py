@@ -41,8 +41,6 @@ class SmoothPart(NamedTuple):
     slope: float
     error: float
     """Its standard error, and its change from the next wider scale."""
-    within: float
-    """The scale of displacements, in the input's unit."""
 
 
 def smooth_part(
@@ -73,7 +71,7 @@ def smooth_part(
     # the widest scale has no wider one that bounds its curvature
     error = SPREAD * errors + np.abs(np.diff(slopes, prepend=np.inf)) / 2.0
     best = min((j for j in rough if scatters[j] >= SATURATED * most), key=lambda j: error[j])
-    return SmoothPart(float(slopes[best]), float(error[best]), float(steps[best]))
+    return SmoothPart(float(slopes[best]), float(error[best]))
 
 
 def _fit(h: float, t: np.ndarray, costs: np.ndarray) -> tuple[float, float, float, float]:

@@ -105,12 +105,6 @@ class Clock:
         slope = 4.0 * each if math.isnan(slope) else slope
         return costs * each + gradients * slope <= share * self.remaining
 
-    def affordable(self, share: float = 1.0) -> float:
-        """Return the number of costs that fit a share (0 to 1) of the remaining budget."""
-        each = self.seconds_per("costs")
-        timed = share * self.remaining / each if each > 0 and math.isfinite(self.budget) else math.inf
-        return max(0.0, min(timed, share * self.remaining_calls))
-
     def limit(self, share: float) -> None:
         """Limit subsequent calls to ``share`` (0 to 1) of the remaining budget."""
         self._deadline = self.spent + share * max(self.remaining, 0.0)

@@ -133,17 +133,18 @@ class Simulator:
         """Return the user's cost of one theta, a vector ``(d,)``, as it is: not counted, timed or interrupted."""
         return self._cost(self._build_theta(vector), *w)
 
-    def trace(self, enter: Callable[..., Any], *parts: np.ndarray) -> None:
-        """Compute the costs of theta and w, ``(d, B)`` and ``(n, B)``, under a trace function; they count, and their time does not."""
+    def trace(self, enter: Callable[..., Any], *parts: np.ndarray) -> np.ndarray:
+        """Return the costs of theta and w, ``(d, B)`` and ``(n, B)``, under a trace function; they count, and their time does not."""
         self.clock.check(1)
         before = sys.gettrace()
         with self.clock.interrupt_when_over():
             sys.settrace(enter)
             try:
-                self._computed("costs", *parts)
+                costs = self._computed("costs", *parts)
             finally:
                 sys.settrace(before)
         self.clock.count("costs", 1, 0.0, warm=False)
+        return costs
 
     # ------------------------------------------------------------------------------------------- columns
 

@@ -1,7 +1,6 @@
 """The budget: what decides comes first, every finished stage is kept, and calls as a budget give the same report anywhere."""
 
 import re
-import sys
 import time
 from functools import partial
 
@@ -167,15 +166,3 @@ def test_exceptions_at_random_calls_are_named_as_such(which):
     report = examine(given[0], THETA, grad=given[1], calls=2000)
     assert (report.status, report.cause) == (1, "nondeterministic"), str(report)
     assert "equal calls raise an exception or return a number" in report.conclusion
-
-
-@pytest.mark.parametrize(
-    ("given", "said"), [({"calls": 500}, r" of 500 calls, \d+ s$"), ({"budget": 20.0}, r"gradients, \d+ s of 20 s$")]
-)
-def test_progress_speaks_of_the_limit_that_holds(given, said, monkeypatch, capsys):
-    """With a limit of calls it said ``5 s of 3,000 calls``."""
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    bench.examine(cost, THETA, grad=grad, **given)
-    lines = [line for line in capsys.readouterr().err.split("\r\x1b[K") if line]
-    assert lines
-    assert all(re.search(said, line) for line in lines), lines

@@ -66,21 +66,12 @@ def test_a_small_error_is_not_decided_where_the_budget_ends_before_the_search_fo
     assert "adaptive steps may explain it" in report.conclusion
     assert "0.10%" in report.conclusion
     assert "refined=COST" in report.advice
-    assert separate(1e-4, forgotten=0.5, calls=120).status == 1
 
 
 def test_a_small_jump_on_a_curved_line_is_found():
     """The largest changes of slope on the line are those of its bends, 40 times the jump."""
     line = lines.scan(lambda t: np.cos(t) + 1e-4 * (t > 1.2345), np.ones(1), 1e-16)
     assert [one.at for one in line.jumps] == pytest.approx([1.2345], abs=1e-5)
-
-
-def test_errors_by_number_of_steps_are_those_of_shared_memory():
-    grown = examine(
-        swing, START, grad=partial(mechanisms.swinging, shared=True, slope=True), horizons=[1, 2, 20]
-    ).explained.growth
-    assert [one.steps for one in grown] == [1, 2, 20]
-    assert grown[0].error < 1e-6 < grown[1].error < grown[2].error
 
 
 # ------------------------------------------------------------------------------------- noise and precision
@@ -128,22 +119,6 @@ def test_errors_within_the_tolerance_are_warnings_with_their_size():
     assert examine(swing, START, grad=off, tolerance={"theta[0]": 2e-3}).status == 1
     with pytest.raises(UserError, match=r"unknown input 'theta.7.'"):
         examine(swing, START, grad=off, tolerance={"theta[7]": 1e-3})
-
-
-def test_inputs_without_effect_fail_where_they_are_not_allowed():
-    def cost(p):
-        return swing([p["q"], p["v"]])
-
-    def grad(p):
-        by_q, by_v = slope([p["q"], p["v"]])
-        return {"q": by_q, "v": by_v, "friction": 0.0}
-
-    theta = {"q": 0.7, "v": 0.3, "friction": 1.0}
-    reports = {allow: examine(cost, theta, grad=grad, allow_zero=allow) for allow in (None, False, "friction")}
-    assert {allow: report.status for allow, report in reports.items()} == {None: 0, False: 1, "friction": 0}
-    assert "zero: friction" in str(reports[None])
-    assert reports[False].cause == "no_effect"
-    assert not any("zero" in text for text in reports["friction"].warnings)
 
 
 # ------------------------------------------------------------------------------------- inputs

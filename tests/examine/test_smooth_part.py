@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
+from simulators import complex_step
 
 import bench
 from bench.gradient.smooth_part import smooth_part
@@ -39,3 +41,27 @@ def test_an_error_of_one_number_of_many_shows_through_a_rough_cost(factor):
         grad=lambda x: 2.0 * factors * x, calls=20_000, progress=False,
     )  # fmt: skip
     assert report.derivative in (("wrong",) if factor != 1.0 else ("right", "not shown")), str(report)
+
+
+def exact(x):
+    """Return the position of a damped oscillator after 4 s; theta is stiffness, damping and first position."""
+    rate, frequency = x[1] / 2, np.sqrt(x[0] - x[1] ** 2 / 4)
+    return x[2] * np.exp(-4 * rate) * (np.cos(4 * frequency) + rate / frequency * np.sin(4 * frequency))
+
+
+@pytest.mark.parametrize(
+    ("answer", "factor", "rtol", "settings"),
+    [("not shown", 1.0, 1e-3, {}), ("right", 1.0, 1e-3, {"refined": exact}), ("wrong", 2.0, 1e-3, {}),
+     ("wrong", 1.03, 1e-3, {"refined": exact}), ("wrong", 1.03, 1e-7, {})],
+)  # fmt: skip
+def test_a_loose_solver_leaves_open_what_its_steps_may_explain(answer, factor, rtol, settings):
+    """At SciPy's default tolerance the cost's slope over any steps is off by 2% of the solution's: no breaks show how far."""
+
+    def cost(x):
+        return solve_ivp(
+            lambda t, z: [z[1], -x[0] * z[0] - x[1] * z[1]], (0, 4), [x[2], 0.0], rtol=rtol, atol=rtol / 1000
+        ).y[0, -1]
+
+    slope = complex_step(exact)
+    report = bench.examine(cost, [8.0, 0.3, 0.9], grad=lambda x: slope(x) * [factor, 1.0, 1.0], calls=2000, **settings)
+    assert report.derivative == answer, str(report)

@@ -164,6 +164,8 @@ def separate(x, **settings):
 adaptive, frozen = (partial(one, rtol=1e-3) for one in (mechanisms.adaptive, mechanisms.frozen))
 treads = {"theta": [1.0], "sigma": 0.1}
 SOFT = {"theta": [1.0], "noise": 1, "calls": 8000}
+DEAD = swing, lambda x: [*slope(x[:2]), 0.0]
+"""The third input has no effect."""
 QUICK = {"theta": [0.12, -1.0], "calls": 30}
 CASES = {
     "an exception of the gradient": (1, "raised", swing, lambda x: 1 / 0, {}),
@@ -189,6 +191,8 @@ CASES = {
     "above the rounding of a cost that stays": (1, "", lambda x: 0.04, lambda x: [-2.5e-6, 0.0], QUICK),
     "an exception elsewhere": (1, "", swing, fails_elsewhere, {}),
     "the gradient of the call before": (1, "", swing, lagging, {"calls": 400}),
+    "an input without effect": (0, "", *DEAD, {"theta": [*START, 1.0]}),
+    "an input that must have one": (1, "no_effect", *DEAD, {"theta": [*START, 1.0], "allow_zero": False}),
     "rounding hides the slope": (3, "unresolved", offset(1e13), smooth_slope, {"theta": POINT, "calls": 800}),
     "a slope below rounding": (3, "unresolved", lambda x: 1e6 + 2e-8 * x[0], lambda x: [0.0], {"theta": [1.0]}),
     "a float32 cost far from zero": (3, "", single, scaled(-1.0, smooth_slope), {"theta": POINT, "calls": 800}),
