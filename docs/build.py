@@ -94,7 +94,7 @@ Beside the files of [every run](reading-results.md#files), each study writes its
   state without contact. `cause` explains a finite but wrong gradient by comparison with the law's own gradient, from
   differences of its cost at a far finer step: `step` (the law's own gradient is right, the step or its derivative is wrong),
   `law` (as wrong at any step size), `both`, or `unknown` where the law's gradient has not converged. `error_share` is the error over the
-  largest gradient of the scene, which cannot vanish, and `level` is what the map draws: `right`, `wrong`, `blows up`, `grew` or `open`.
+  largest gradient of the scene, which cannot vanish, and `level` is what the map draws: `right`, `wrong`, `near 0`, `blows up`, `grew` or `open`.
   `stability_shares.csv` has the share of each by integrator and law.
 - `three_errors.csv`: forward, program, model and estimator error, absolute and relative. `three_errors_traps.csv`: programs with an exact
   gradient and a converging cost whose gradient does not converge to that of the physics, with their errors at the largest and the smallest step.

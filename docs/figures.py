@@ -287,7 +287,7 @@ FIGURES: dict[str, str | Callable[[], str]] = {
     },
     **{
         f"stability-{name.replace(' ', '-')}": stability(name)
-        for name in ("cells", "wrong", "blows up", "grew", "by step", "by law", "by both", "by unknown")
+        for name in ("cells", "wrong", "near 0", "blows up", "grew", "by step", "by law", "by both", "by unknown")
     },
     "cost-implicit-100": "stiffness_sweep_cost/bias_variance | estimator=fobg, contact=complementarity, backend=implicit, samples=100 | time_s | seconds",
     "cost-explicit-100": "stiffness_sweep_cost/bias_variance | estimator=fobg, contact=penalty, backend=jax, samples=100 | time_s | seconds",

@@ -45,13 +45,14 @@ REACH = np.logspace(-3, 4, 141)
 """Values of dt^2 stiffness that the search for the stability limit tries."""
 WORST_FIRST = ("nonfinite", "diverged", "wrong_sign", "zero", "inaccurate", "unresolved", "ok")
 EDGES = {1e-3: "#08519c", 1e-2: "#6baed6", 1e-1: "#d6e6f4", 1.0: "#fdae61", math.inf: "#c51b1b"}
-"""Upper ends of the grades of an error, in units of the largest gradient of the scene, and their colours."""
-LOST = {
+"""Upper ends of the grades of a relative error, and their colours."""
+OTHER = {
+    "near 0": Style("#ffe873", meaning="the gradient is near 0: not judged"),
     "blows up": Style("#333333", meaning="blows up: the state or the gradient is not finite, or leaves its scale"),
     "grew": Style("#a6a6a6", meaning="grew: a state that cannot grow does, slowly"),
     "open": Style("#f2f2f2", meaning="open: the truth is not resolved"),
 }
-"""Looks of the cells without an error."""
+"""Looks of the cells that are neither right nor wrong."""
 CAUSES = ("step", "law", "both", "unknown")
 LIMIT = "stability limit of the step in theory"
 GROWN = "has grown by"
@@ -60,14 +61,15 @@ RESULTS = (
 )  # fmt: skip
 SHARES = (
     text("scene"), text("step", label="law and integrator"), Column("cells", format="setting"),
-    *(Column(name, format="percent") for name in ("right", "wrong", *LOST)),
+    *(Column(name, format="percent") for name in ("right", "wrong", *OTHER)),
     *(Column(f"by {cause}", label=f"wrong by {cause}", format="percent") for cause in CAUSES),
 )  # fmt: skip
 SHARE_NOTES = (
-    "Errors are in units of the largest gradient of the scene, at any stiffness: the gradient itself passes through 0. Right: an error "
-    "below the limit of the study. Blows up: the state or the gradient is not finite, or leaves its scale. Grew: a state that cannot grow "
-    "does, slowly. Wrong by step: the step or its derivative is wrong and the law is right. By law: wrong at any step. By both, by "
-    "unknown: the cause is not resolved. Shares are of the cells.",
+    "Right: an error below the study's limit, as a share of the cell's own gradient. Near 0: not right, but "
+    "gradient and error are below that share of the scene's largest gradient: it passes through 0, where a share of it says little. Blows up: "
+    "the state or the gradient is not finite, or leaves its scale. Grew: a state that cannot grow does, slowly. Wrong by step: the step or "
+    "its derivative is wrong and the law is right. By law: wrong at any step. By both, by unknown: the cause is not resolved. Shares are of "
+    "the cells.",
 )
 
 
@@ -400,7 +402,8 @@ def cells_of(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     error = cells["relative_error"] * cells["truth_norm"] / size
     is_lost = cells["verdict"].isin(("diverged", "nonfinite"))
     grew = cells["reason"].str.contains(GROWN) & (cells["grad_norm"] <= limits.diverged * size)
-    kinds = {"grew": is_lost & grew, "blows up": is_lost, "open": error.isna(), "right": error <= limits.inaccurate}
+    kinds = {"grew": is_lost & grew, "blows up": is_lost, "open": error.isna(),
+             "right": cells["relative_error"] <= limits.inaccurate, "near 0": np.maximum(error, cells["truth_norm"] / size) <= limits.inaccurate}  # fmt: skip
     level = np.select([*kinds.values()], [*kinds], "wrong")
     over = axes_of(shown, "dt", "stiffness")
     return cells.assign(
@@ -433,16 +436,15 @@ def charts(cells: pd.DataFrame, limit: float) -> list[Chart]:
     # a law without stiffness is the same at each one
     frame = cells.assign(stiffness=[[k] if k == k else every for k in cells["stiffness"]])
     frame = frame.explode("stiffness", ignore_index=True).astype({"stiffness": float})
-    worst = frame["error_share"].fillna(math.inf).where(frame["level"] != "open", -1.0)
+    worst = frame["relative_error"].fillna(math.inf).where(frame["level"] != "open", -1.0)
     frame = frame.iloc[worst.argsort(kind="stable")[::-1]].drop_duplicates(["problem", "dt", "stiffness"]).sort_index()
     frame = frame[frame["problem"] == frame.groupby("step", sort=False)["problem"].transform("first")]
     grades, looks = graded(
-        frame["error_share"].map(rounded), EDGES, "{} of the largest gradient".format, lambda end: f"{100 * end:g}%"
+        frame["relative_error"].map(rounded), EDGES, "error {}".format, lambda end: f"{100 * end:g}%"
     )
-    frame["grade"] = frame["level"].where(frame["level"].isin(LOST), grades)
-    is_small = (frame["level"] == "right") & (frame["verdict"] != "ok")
-    frame["cell"] = ["" if e != e else (f"<{100 * min(EDGES):g}" if e < min(EDGES) else number(100 * e) if e < 10 else ">999") + "*" * small
-                     for e, small in zip(frame["error_share"], is_small, strict=True)]  # fmt: skip
+    frame["grade"] = frame["level"].where(frame["level"].isin(OTHER), grades)
+    frame["cell"] = ["" if e != e else (f"<{100 * min(EDGES):g}" if e < min(EDGES) else number(100 * e) if e < 10 else ">999")
+                     for e in frame["relative_error"]]  # fmt: skip
     found: list[Chart] = []
     for scene, part in frame.groupby("scene_name", sort=False):
         panel = "step" if part["contact"].nunique() > 1 else "integrator"
@@ -453,10 +455,10 @@ def charts(cells: pd.DataFrame, limit: float) -> list[Chart]:
         (name,) = short_names([f"{scene}, {part['variant'].max()}"], is_whole=True).values()
         found.append(Chart(
             f"stability_map_{scene}" if found else "stability_map", part,
-            [Column("dt_ms", "", "ms", label="time step")], [COMMON["stiffness"]], "grid", level="grade", styles=looks | LOST, panel=panel,
+            [Column("dt_ms", "", "ms", label="time step")], [COMMON["stiffness"]], "grid", level="grade", styles=looks | OTHER, panel=panel,
             cell="cell", limit="stiffness_limit", limit_name=LIMIT, height=0.16,
-            subtitle=f"{name}. Number: error of the gradient, in % of the largest gradient of the scene at any stiffness"
-                     + f". *: more than {100 * limit:g}% of the cell's own gradient, which is small" * any("*" in cell for cell in part["cell"]),
+            subtitle=f"{name}. Number: error of the gradient, in % of the true one. Near 0: gradient and error are below {100 * limit:g}% "
+                     "of the scene's largest gradient",
             text="The worst where backends disagree. Of several contact laws, each is drawn with the integrator that is most often right.",
         ))  # fmt: skip
     return found
