@@ -88,7 +88,7 @@ class Chart:
     """The column whose values are one or two points each: ``points`` joins two by an arrow, named ``arrow_name``."""
     arrow_name: str = ""
     failed: str = ""
-    """The column that is true where a point has no value: a cross at the upper edge, named ``failed_name`` like a blank cell."""
+    """The column that is true where a point has no value: a cross at the upper edge, or at the lower one for 0, named ``failed_name`` like a blank cell."""
     failed_name: str = "no result"
     across: int = 4
     """Most panels side by side."""

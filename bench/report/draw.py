@@ -319,7 +319,10 @@ def _draw_values(
     given, is_cut = values, values > most
     if log:  # what has no logarithm is an upper limit too, at the least value that has one
         every = chart.frame[column.name]
-        limit, values = limit | (values <= column.least), values.clip(column.least or every[every > 0].min(), most)
+        limit, values = (
+            (limit | (values <= column.least)) & ~lost,
+            values.clip(column.least or every[every > 0].min(), most),
+        )
     is_flat = chart.kind == "dots"
     edge = panel.get_yaxis_transform() if is_flat else panel.get_xaxis_transform()
     look: dict[str, Any] = {"color": style.colour, "zorder": zorder}
@@ -330,7 +333,7 @@ def _draw_values(
     is_hollow, size = limit & bool(marker), 2.55 + 1.5 * style.width
     plot(
         places,
-        np.where(is_hollow, math.nan, values),  # no line joins a limit to a value
+        np.where(is_hollow | lost, math.nan, values),  # no line joins a limit to a value
         marker=marker,
         linestyle=style.line if chart.kind == "lines" else "none",
         linewidth=style.width,
@@ -355,6 +358,7 @@ def _draw_values(
         else:
             (panel.hlines if is_flat else panel.vlines)(places[known], low[known], high[known], linewidth=1.0, **look)
     if is_cut.any():  # beside the panel, above the values that were cut before
+        _name(panel, "largest beyond the axis", marker="$\u2191$")
         last = int(np.nanargmax(np.where(is_cut, given, np.nan)))
         cuts = [text.get_text() for text in panel.texts if text.get_gid() == "cut"]
         label = f"{number(given[last])} {'→' if is_flat else '↑'}"
@@ -364,7 +368,7 @@ def _draw_values(
                            ha="left" if is_flat else "center", annotation_clip=False)  # fmt: skip
     if lost.any():
         _name(panel, chart.failed_name, marker="x")
-        plot(places[lost], np.full(lost.sum(), 0.97), marker="x", linestyle="none", transform=edge, markersize=5,
+        plot(places[lost], (given[lost] != 0) * (1.0 if is_flat else 0.97), marker="x", linestyle="none", transform=edge, markersize=5,
              markeredgewidth=1.4, clip_on=False)  # fmt: skip
 
 

@@ -125,7 +125,7 @@ def test_planted_errors_of_a_run_have_their_size_on_the_common_path(run):
 
 
 def test_problems_that_the_best_gradient_solves_in_a_few_updates_do_not_count():
-    base = {"scene_class": "smooth", "target": 100.0, "budget": 50.0, "error": 0.0, "kind": analysis.BEST}
+    base = {"scene_class": "smooth", "target": 100.0, "error": 0.0, "kind": analysis.BEST}
     table = pd.DataFrame(
         [base | {"problem": name, "median": m} for name, m in (("easy", 2.0), ("fine", 9.0), ("hard", math.inf))]
     )
@@ -146,7 +146,7 @@ def test_interval_of_a_median_has_the_order_statistics_of_the_tables(n, low, hig
 
 
 def planted(scene, kind, dose, updates, problem=""):
-    return {"problem": f"{scene}{problem}", "scene": scene, "scene_class": "smooth", "kind": kind, "dose": dose, "error": dose, "target": 100.0,
+    return {"problem": f"{scene}{problem}", "scene": scene, "scene_class": "smooth", "kind": kind, "method": kind, "dose": dose, "error": dose, "target": 100.0,
             "median": updates}  # fmt: skip
 
 

@@ -35,10 +35,10 @@ ORDERS = ("first order", "zeroth order")
 DOSES = {"noise": RANDOM, "bias": BIAS, "angle": ROTATION}
 """Parameters of an estimator with a planted error, and the kind of error."""
 COMPARISONS: dict[str, tuple[tuple[str, float], tuple[str, float]]] = {
+    "random error 3 / 0.3": ((RANDOM, 3.0), (RANDOM, 0.3)),
     "random error 0.3": ((RANDOM, 0.3), (BEST, 0.0)),
     "random error 1": ((RANDOM, 1.0), (BEST, 0.0)),
     "random error 3": ((RANDOM, 3.0), (BEST, 0.0)),
-    "random error 3 / 0.3": ((RANDOM, 3.0), (RANDOM, 0.3)),
     "bias 0.6": ((BIAS, 0.6), (BEST, 0.0)),
     "bias 0.9": ((BIAS, 0.9), (BEST, 0.0)),
     "bias 0.9 / random error 1": ((BIAS, 0.9), (RANDOM, 1.0)),
@@ -135,7 +135,7 @@ def ratios(lines: pd.DataFrame) -> pd.DataFrame:
     A missed target is infinite, and a problem on which both sides are missed has no ratio. Comparisons: of updates, by
     :data:`COMPARISONS`; of updates at a wrong rate with those at the best one; of rollouts, of the first with the zeroth order, each
     at its cheapest number of samples; of rollouts at the fewest samples that reach the target with the cheapest other number;
-    and of updates at equal error, the median over the samples of an order with planted random errors between the planted sizes.
+    and of updates at equal error, the median over the cells of an estimator with planted random errors between the planted sizes.
     """
     result = []
     keys = ["scene_class", "target", "scene", "problem"]
@@ -166,11 +166,14 @@ def _sides(own: pd.DataFrame) -> Iterator[tuple[str, tuple[float, float]]]:
         if part["method"].nunique() == 1 and len(costs) > 1:
             yield f"fewest samples / others, {kind}", (costs[0], costs[1:].min())
     planted = own[(own["kind"] == RANDOM) & np.isfinite(own["median"])].sort_values("error")
-    for kind, part in natural.groupby("kind"):
+    for estimator, part in natural.groupby(natural["method"].str.split("[").str[0]):
         between = part[part["error"].between(planted["error"].min(), planted["error"].max())]
         if len(between):
             expected = np.interp(*map(np.log, (between["error"], planted["error"], planted["median"])))
-            yield f"{kind} / random error, equal error", (float((between["median"] / np.exp(expected)).median()), 1.0)
+            yield (
+                f"{estimator} / random error, equal error",
+                (float((between["median"] / np.exp(expected)).median()), 1.0),
+            )
 
 
 def rollouts_to_target(lines: pd.DataFrame, charge: float) -> pd.Series:
@@ -205,8 +208,6 @@ def median_interval(values: np.ndarray) -> tuple[float, float, float]:
     """
     values = np.sort(values)
     n = len(values)
-    if not n:
-        return math.nan, 0.0, math.inf
     k = sum(2 * bdtr(k, n, 0.5) <= 0.05 for k in range(n // 2))
     low, high = (float(values[k - 1]), float(values[n - k])) if k else (0.0, math.inf)
     return float(np.median(values)), low, high
@@ -218,8 +219,8 @@ def median_interval(values: np.ndarray) -> tuple[float, float, float]:
 def reached(table: pd.DataFrame) -> pd.DataFrame:
     """Return a line per problem and method without a planted error, if some use costs only.
 
-    Columns: problem, scene_class, kind, method, runs, hits (searches that reach 1/100), missed, and evaluations with fewest and
-    most over the searches: updates times the rollouts and gradients of an update.
+    Columns: problem, scene_class, kind, method, runs, hits (searches that reach 1/100), missed, rollouts_per_update, and evaluations
+    with fewest and most over the searches, infinite where one misses: updates times the rollouts and gradients of an update.
     """
     main = table[~table["kind"].isin(PLANTED) & (table["target"] == MAIN)].copy()
     if not (main["kind"] == COSTS_ONLY).any():
@@ -229,11 +230,19 @@ def reached(table: pd.DataFrame) -> pd.DataFrame:
     spent = main["times"] * (main["rollouts_per_update"] + main["gradients_per_update"])
     main["missed"] = np.isinf(main["median"])
     main["hits"], main["runs"] = spent.map(lambda v: int(np.isfinite(v).sum())), spent.map(len)
-    for name, end in (("evaluations", np.median), ("fewest", np.min), ("most", _largest)):
+    for name, end in (("evaluations", np.median), ("fewest", np.min), ("most", np.max)):
         main[name] = spent.map(end).mask(main["missed"])
-    names = ["problem", "scene_class", "kind", "method", "runs", "hits", "missed", "evaluations", "fewest", "most"]
+    names = [
+        "problem",
+        "scene_class",
+        "kind",
+        "method",
+        "runs",
+        "hits",
+        "missed",
+        "rollouts_per_update",
+        "evaluations",
+        "fewest",
+        "most",
+    ]
     return main[names].reset_index(drop=True)
-
-
-def _largest(values: np.ndarray) -> float:
-    return float(values[np.isfinite(values)].max(initial=0.0))

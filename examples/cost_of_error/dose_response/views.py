@@ -12,10 +12,11 @@ from bench.experiment.columns import Column, interval, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Mark, Style, Table, Views
 from bench.report.colours import method_styles
+from bench.report.names import short_names
 from bench.report.style import PALETTE
 
 from . import analysis
-from .analysis import BEST, COSTS_ONLY, MAIN
+from .analysis import BEST, MAIN
 
 NO_VERDICT = Style("#767676")
 VERDICTS = {
@@ -85,11 +86,16 @@ def _problems(table: pd.DataFrame) -> Table:
 
 def _ratios(pairs: pd.DataFrame) -> Chart:
     """Return the ratios: a row per comparison, whose interval reaches the edge where it has no end."""
+    frame = pairs.assign(
+        is_missed=pairs["ratio"].isin((0.0, np.inf)),
+        comparison=pairs["comparison"] + pairs["scenes"].map(" ({})".format),
+    )
     return Chart(
-        "ratios", pairs.assign(ratio=pairs["ratio"].where(pairs["ratio"] > 0), is_missed=np.isinf(pairs["ratio"])), [interval("ratio", label="times the updates, or rollouts between orders and samples", log=True)],
+        "ratios", frame, [interval("ratio", label="times the updates; of orders and samples: times the rollouts", log=True)],
         [text("comparison", label="")], "dots", series="verdict", styles=VERDICTS, marks=[Mark("the same", 1.0)], failed="is_missed",
-        failed_name="more than half of the scenes miss the target", height=0.24,
-        subtitle=f"to 1/{MAIN:g} of the first regret, median over scenes; a single error is over the best gradient, a pair over its second",
+        failed_name="most scenes miss the target; at the left edge: with what it is compared to", height=0.24,
+        subtitle=f"to 1/{MAIN:g} of the first regret, median over scenes, whose number is in brackets; an error alone is compared to the best gradient. "
+                 "Gradient 2: it counts as two rollouts",
     )  # fmt: skip
 
 
@@ -104,11 +110,14 @@ def _reached(known: pd.DataFrame) -> Table:
 
 
 def _reached_chart(known: pd.DataFrame) -> Chart:
-    methods = dict.fromkeys(known.sort_values("kind", key=lambda kinds: kinds == COSTS_ONLY, kind="stable")["method"])
-    looks = method_styles(methods) | {BEST: replace(NO_VERDICT, meaning=f"{BEST}: without noise")}
+    looks = method_styles(dict.fromkeys(known["method"])) | {
+        BEST: replace(NO_VERDICT, meaning=f"{BEST}: without noise; where the cost jumps, a mean of rollouts")
+    }
+    most = known.groupby("problem")["rollouts_per_update"].transform("max")
+    names = known["problem"].map(short_names(known["problem"])) + most.map(" ({:,.0f})".format)
     return Chart(
-        "reached", known, [Column("evaluations", label="rollouts and gradients to 1/100", low="fewest", high="most", ends="range of the searches", log=True)],
+        "reached", known.assign(problem=names), [Column("evaluations", label="rollouts and gradients to 1/100", low="fewest", high="most", ends="range of the searches", log=True)],
         [text("problem", label="")], "dots", series="method", styles=looks, failed="missed", failed_name="most searches miss it", height=0.55,
-        subtitle=f"to 1/{MAIN:g} of the first regret, each method at its best rate, median of searches",
-        text="Best gradient: without noise, or the mean of many costs times scores where the cost jumps. A dot is the median over the searches of a method and a bar their range. A gradient counts as one rollout.",
+        subtitle=f"to 1/{MAIN:g} of the first regret, each method at its best rate, median of searches; in brackets the rollouts that an update takes without a gradient",
+        text="A bar reaches the edge where a search misses the target. A gradient counts as one rollout.",
     )  # fmt: skip
