@@ -54,7 +54,8 @@ def chart(claim: type[Claim], result: ClaimResult) -> Chart | None:
             "series": label, "x": places, "y": values[0], "low": np.maximum(low, 0.1 * values[0]) if is_log["y"] else low, "high": high,
         }))  # fmt: skip
         with np.errstate(all="ignore"):
-            height = np.log(values[0].to_numpy()) if is_log["y"] else values[0].to_numpy()
+            height = values[0].to_numpy()
+            height = np.log(height) if is_log["y"] else height
         if any(np.isclose(height, other, rtol=0.0, atol=0.01 * np.ptp(other)).mean() > 0.5 for other in drawn):
             styles[label] = Style("#D55E00", "", (0, (2, 2)))  # both of two lines on top of each other are seen
         drawn.append(height)

@@ -67,7 +67,7 @@ class PenaltyPhase(Claim):
     lesson = "Stiffness or step size"
     statement = "A penalty bounce's gradient error grows with stiffness, and falls a hundredfold with the step."
     source = f"{SOURCE}; recomputed over 256 phases"
-    learned = "A hundred times the stiffness at a hundredth of the step has the same error: what counts is stiffness times step."
+    learned = "A hundredth of the step has the same error at a hundred times the stiffness: what counts is stiffness times step."
     origin = "recomputed"
     quantity = "RMS of df/dy0 + 1"
     logarithmic = "xy"

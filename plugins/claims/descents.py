@@ -12,7 +12,11 @@ from bench.claims import Claim, Figure, Outcome
 from bench.claims.toolkit import exact_descent, native, plugin
 from bench.model import Array, MechanicalScene, State
 
-LAWS = {"with time of impact": "impulse", "without": "impulse[time_of_impact=false]", "penalty": "penalty"}
+LAWS = {
+    "with time of impact": "impulse",
+    "without it: wrong gradient": "impulse[time_of_impact=false]",
+    "penalty": "penalty",
+}
 EVERY = {"iteration": list(range(0, 1001, 20))}
 SINGLE = 2 * 2.0**-24 * math.sqrt(288)
 """Relative rounding error of position and velocity over 288 steps in single precision, as in the published ends of C10."""
@@ -41,9 +45,7 @@ class Throw(Claim):
         "penalty."
     )
     source = "Zhong, Han, Brikis 2022, arXiv 2207.05060, task 2"
-    learned = (
-        "A wrong gradient can still find a way, another one and a worse one; the forward law decides what is reachable."
-    )
+    learned = "A wrong gradient can still find a way, but a worse one; a contact law that moves otherwise can find a better one."
     quantity = "squared distance to the target [m^2]"
     logarithmic = "y"
     quick = False

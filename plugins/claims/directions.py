@@ -30,12 +30,13 @@ class Directions(Claim):
     learned = "Zeroth order pays for dimension: it needs as many samples as variables to be 100% off."
     quantity = "relative squared error"
     logarithmic = "xy"
+    marks = (("y", 1.0, "100% off"),)
     quick = False
 
     def measure(self) -> Outcome:
         """Sample estimates at two noise levels."""
         figures: list[Figure] = []
-        series: dict[str, list[Any]] = {"samples N": list(REPEATS), **{key: [] for key in NAMES}}
+        series: dict[str, list[Any]] = {f"samples N, of {D} variables": list(REPEATS), **{key: [] for key in NAMES}}
         draw = np.random.default_rng(7)
         for count, texts in ((20, ("1.05", "0.95")), (100, ("0.21", "0.19")), (400, ("0.0525", "0.0475"))):
             noise = [draw.standard_normal((CHUNK, count, D)) for _ in range(REPEATS[count] // CHUNK)]

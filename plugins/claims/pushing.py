@@ -73,7 +73,7 @@ class SmoothedPush(Claim):
                 f"at the hard end the first order's variance is that of a few samples: between {low:.1e} and {high:.1e} over "
                 "12 seeds of 1,000; and h^2 2 k / m = 50 there, beyond the step's stability limit of 3.2"
             ),
-            series=_by_order("sharpness beta [1/m]", published, ("first order", "zeroth order"), variances),
+            series=_by_order("sharpness beta, 1 / width [1/m]", published, ("first order", "zeroth order"), variances),
         )
 
 

@@ -90,8 +90,8 @@ class OtherObjective(Claim):
     statement = "iLQR swings a pendulum up in five iterations: 1856.154, 1202.106, 699.799, 423.583, 357.476, 357.297."
     source = "Suh et al. 2021, Bundled gradients, public result file"
     origin = "data file"
-    learned = "Say which objective was given and on which one it is scored; nobody can tell from the curve."
-    quantity = "cost above the least, 349.49"
+    learned = "The same method ends higher if it is given other weights than it is scored with: say which objective was given."
+    quantity = "cost with weights 1 and 1, above the least, 349.49"
     logarithmic = "y"
 
     def measure(self) -> Outcome:
