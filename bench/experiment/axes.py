@@ -46,9 +46,9 @@ class Axis:
 
     @property
     def title(self) -> str:
-        """The axis with its unit and the axes that step with it: ``dt [s], with horizon``."""
+        """The axis with its unit and the axes that step with it: ``dt [s], and with it horizon``."""
         unit = f" [{self.unit}]" if self.unit not in ("", self.column) else ""
-        return f"{self.column}{unit}" + (f", with {', '.join(self.moves)}" if self.moves else "")
+        return f"{self.column}{unit}" + (f", and with it {', '.join(self.moves)}" if self.moves else "")
 
 
 def values_of(axis: Axis, rows: pd.DataFrame) -> np.ndarray:

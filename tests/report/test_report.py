@@ -293,7 +293,7 @@ def test_zipped_axes_do_not_split_problems_and_are_named_together():
     assert set(charts) == {"bias_variance_stiffness"}
     assert "dt" in charts["bias_variance_stiffness"].x[0].heading
     titles = [axis.title for axis in views.arrange(experiment(sweep=sweep), rows).axes]
-    assert titles == ["stiffness [N/m], with dt", "dt [s], with stiffness"]
+    assert titles == ["stiffness [N/m], and with it dt", "dt [s], and with it stiffness"]
 
 
 def test_seeds_become_medians_of_those_that_are_ok():

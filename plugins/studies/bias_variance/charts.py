@@ -42,7 +42,7 @@ GRADES = {0.1: "#08519c", 0.3: "#6baed6", 1.0: "#d6e6f4", 10.0: "#fdae61", math.
 """Upper ends of the grades of an error, and their colours."""
 BEHIND = {3.0: "#6baed6", 10.0: "#d6e6f4", math.inf: "#fdae61"}
 """Upper ends of the grades of a factor to the first method, and their colours."""
-FIRST = "first, or tied with it"
+FIRST = "first, or tied: the 95% interval of its factor to the first reaches 1"
 PANELS = 4
 """Most problems of a chart along an axis."""
 RMSE = Column(

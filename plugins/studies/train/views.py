@@ -312,7 +312,7 @@ def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
         curves,
         name="times",
         x=[TIME],
-        title="The same returns against the time of the updates",
+        title="Which return is reached after which time of updates?",
         text="The median time over seeds, beside other work.",
     )
     final = windows.assign(cost=-windows["final"], cost_low=-windows["final_high"], cost_high=-windows["final_low"])
