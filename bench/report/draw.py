@@ -319,10 +319,8 @@ def _draw_values(
     given, is_cut = values, values > most
     if log:  # what has no logarithm is an upper limit too, at the least value that has one
         every = chart.frame[column.name]
-        limit, values = (
-            (limit | (values <= column.least)) & ~lost,
-            values.clip(column.least or every[every > 0].min(), most),
-        )
+        limit = (limit | (values <= column.least)) & ~lost
+        values = values.clip(column.least or every[every > 0].min(), most)
     is_flat = chart.kind == "dots"
     edge = panel.get_yaxis_transform() if is_flat else panel.get_xaxis_transform()
     look: dict[str, Any] = {"color": style.colour, "zorder": zorder}
