@@ -33,6 +33,8 @@ RELATIVE = 0.01
 """Default sigma of the line scans, and of a cost with its own noise, in units of each input's scale."""
 SEEN = 0.01
 """Share of a cost's change along a line that the integral of the gradient may miss without a warning."""
+RESOLVED = 0.02
+"""Relative error of a difference, up to which it shows that a component is right."""
 DIGIT = 0.1
 """Largest uncertainty of a difference that shows a derivative, relative to the derivative or to slopes nearby."""
 CONTRADICTED = 10.0
@@ -349,16 +351,18 @@ class Findings:
         """The components that the check accepts, though differences cannot see them or contradict them.
 
         A component is seen if its difference has one correct digit, compared with the derivative or with the slopes of
-        wider steps, which are not 0 at a minimum. Unseen components that are small beside the seen ones do not count, unless
-        their input is so small that it need not be its own scale.
+        wider steps, which are not 0 at a minimum; one that is not small beside these has to be known to :data:`RESOLVED`. Unseen
+        components that are small do not count, unless their input is so small that it need not be its own scale.
         """
         parts = [p for p in self.settled.components if p.verdict in TRUSTED and p.verdict != "zero"]
-        seen = [p for p in parts if p.uncertainty < DIGIT * max(abs(p.difference), _slope_nearby(p.sample))]
+        sizes = {p.name: max(abs(p.difference), _slope_nearby(p.sample)) for p in parts}
+        seen = [p for p in parts if p.uncertainty < DIGIT * sizes[p.name]]
         largest = max((abs(p.difference) * p.sample.scale for p in seen), default=0.0)
         hidden = [
             p
             for p in parts
-            if p not in seen and (abs(p.program) * p.sample.scale >= DIGIT * largest or p.sample.scale < TINY)
+            if (p.uncertainty >= RESOLVED * sizes[p.name] and abs(p.program) * p.sample.scale >= DIGIT * largest)
+            or (p not in seen and p.sample.scale < TINY)
         ]
         contradicted = [
             p

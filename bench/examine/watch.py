@@ -193,7 +193,7 @@ class Watch:
         failed = [row for row in self.rows if row["reason"]]
         text = (f"{checks}, {len(failed)} not: {failed[0]['reason']}" if failed else checks) + self._unwritten
         if self.first is None:
-            return f"{text}: no fault of the gradient"
+            return f"{text}: {'no fault of the gradient' if len(self.rows) > len(failed) else 'nothing is known of the gradient'}"
         iteration, code = self.first
         meaning = RULES[code].meaning if code in RULES else MEANINGS[code]
         return f"{text}: of no use from iteration {iteration} on ({code}: {meaning})"

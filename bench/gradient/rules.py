@@ -179,7 +179,7 @@ EXAMINATION = {
     ),
     "unresolved": Rule(
         "open", "rounding or noise of the cost hides its slope at every step, or contradicts a small derivative",
-        "right, but the error of the difference is above {findings.DIGIT:.0%} of it, of derivatives that matter and of inputs below {findings.TINY:g}, or both are {findings.CONTRADICTED:g} errors and "
+        "right, but the error of the difference is above {findings.RESOLVED:.0%} of it, of derivatives that matter, or above {findings.DIGIT:.0%}, of inputs below {findings.TINY:g}; or both are {findings.CONTRADICTED:g} errors and "
         "{findings.DIGIT:.0%} apart; or not 0 and below {findings.PART:.0%} of a difference that is below about {findings.SLIGHT:g} of the largest right derivative",
     ),
     "adaptive": Rule(

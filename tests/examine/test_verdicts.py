@@ -31,8 +31,8 @@ def offset(size):
     return lambda x: smooth(x) + size
 
 
-def single(x):
-    return np.float32(np.float32(1e5) + np.float32(smooth(x)))
+def single(size):
+    return lambda x: np.float32(np.float32(size) + np.float32(smooth(x)))
 
 
 def noisy(x):
@@ -195,7 +195,8 @@ CASES = {
     "an input that must have one": (1, "no_effect", *DEAD, {"theta": [*START, 1.0], "allow_zero": False}),
     "rounding hides the slope": (3, "unresolved", offset(1e13), smooth_slope, {"theta": POINT, "calls": 800}),
     "a slope below rounding": (3, "unresolved", lambda x: 1e6 + 2e-8 * x[0], lambda x: [0.0], {"theta": [1.0]}),
-    "a float32 cost far from zero": (3, "", single, scaled(-1.0, smooth_slope), {"theta": POINT, "calls": 800}),
+    "a float32 cost far from zero": (3, "", single(1e5), scaled(-1.0, smooth_slope), {"theta": POINT, "calls": 800}),
+    "a float32 slope that is known to 4%": (3, "unresolved", single(3e3), scaled(1.04, smooth_slope), {"theta": POINT, "calls": 800}),
     "a small component": (0, "", small_slope, with_small(1e-6), {"theta": POINT, "calls": 1500}),
     "a small component that is wrong": (3, "unresolved", small_slope, with_small(1e-3), {"theta": POINT, "calls": 1500}),
     "what a solver leaves of a derivative of 0": (3, "unresolved", residue(1e-6), by_size(8e-8), {}),

@@ -145,6 +145,7 @@ def test_a_failing_cost_does_not_end_the_loop(tmp_path):
     log(np.ones(2), np.ones(3))
     assert log.first is None
     assert "2 not: UserError: the cost cannot be called at theta: KeyError: 'missing'" in str(log)
+    assert str(log).endswith("nothing is known of the gradient")
     with (tmp_path / "log.csv").open() as file:
         assert [row["iteration"] for row in csv.DictReader(file)] == ["0", "1"]
 
