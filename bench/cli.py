@@ -482,66 +482,100 @@ def _main_of(module: str) -> Callable[[list[str]], int]:
 
 VERBS = {
     "run": Verb(
-        _run, "+experiment=NAME [key=value ...]", "run what is missing, then write tables and charts",
-        f"Without an experiment, name=FOLDER and the settings say what is run.\n{SETTINGS}{STATUS}", "Experiments",
+        _run,
+        "+experiment=NAME [key=value ...]",
+        "run what is missing, then write tables and charts",
+        f"Without an experiment, name=FOLDER and the settings say what is run.\n{SETTINGS}{STATUS}",
+        "Experiments",
     ),
     "report": Verb(
-        _report, "report +experiment=NAME [key=value ...]", "tables and charts again from stored rows",
-        "Nothing is simulated.\n" + SETTINGS, "Experiments",
+        _report,
+        "report +experiment=NAME [key=value ...]",
+        "tables and charts again from stored rows",
+        "Nothing is simulated.\n" + SETTINGS,
+        "Experiments",
     ),
     "plan": Verb(
-        _plan, "plan +experiment=NAME [key=value ...]", "cells, how many are stored, expected time",
-        "Cells that cannot run are listed with their reason.\n" + SETTINGS, "Experiments",
+        _plan,
+        "plan +experiment=NAME [key=value ...]",
+        "cells, how many are stored, expected time",
+        "Cells that cannot run are listed with their reason.\n" + SETTINGS,
+        "Experiments",
     ),
     "list": Verb(
-        _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins by kind; for a KIND or NAME also parameters and availability",
-        "KIND is scenes, contacts, integrators, backends, estimators, optimizers, policies, trainers or studies.\n", "Experiments",
+        _list,
+        "list [KIND or NAME ...] [plugins=DIR]",
+        "plugins by kind; for a KIND or NAME also parameters and availability",
+        "KIND is scenes, contacts, integrators, backends, estimators, optimizers, policies, trainers or studies.\n",
+        "Experiments",
     ),
     "engines": Verb(
-        _main_of("bench.engines.command"), "engines [install NAME ... | table [NAME ...] | set OUT | metamorphic MODEL]",
+        _main_of("bench.engines.command"),
+        "engines [install NAME ... | table [NAME ...] | set OUT | metamorphic MODEL]",
         "physics engines in a Python of their own, and tests for any engine",
         "Without arguments it lists each engine's environment, or how to make it. The environments are in $BENCH_ENGINES,\n"
         "otherwise in the user's cache. plugins=DIR: engines of your own. NAME==VERSION: another release.\n  install      makes environments from the engines' requirements; --again makes them from the start\n"
         "  table        writes a page and a CSV of the conformance set and engine_gradients (key=value: its settings), out=DIR\n"
-        "  set          copies the conformance set into OUT\n  metamorphic  checks mujoco, or NAME, on MODEL without a reference: steps=60 seed=0\n", "Experiments",
+        "  set          copies the conformance set into OUT\n  metamorphic  checks mujoco, or NAME, on MODEL without a reference: steps=60 seed=0\n",
+        "Experiments",
     ),
     "check": Verb(
-        _check, "check [NAME ...] [limit=15m] [plugins=DIR] [option of pytest ...]", "plugins: does each do what it declares?",
+        _check,
+        "check [NAME ...] [limit=15m] [plugins=DIR] [option of pytest ...]",
+        "plugins: does each do what it declares?",
         "Runs the conformance kit on the named plugins, or on all, in pytest: -k WORD selects checks, -x stops at the first\n"
         "failure, --junitxml=FILE writes a report. A check that takes longer than `limit` or ends its process fails.\n"
-        "Exit status 1 when a check fails.\n\n" + FAMILY, "Is it right?",
+        "Exit status 1 when a check fails.\n\n" + FAMILY,
+        "Is it right?",
     ),
     "gradcheck": Verb(
-        _gradcheck, "gradcheck SCENE ... [key=value ...]", "scenes: is each gradient the derivative of its program?",
+        _gradcheck,
+        "gradcheck SCENE ... [key=value ...]",
+        "scenes: is each gradient the derivative of its program?",
         "Compares gradients with differences of the cost, also at a contact switch.\n"
-        f"Exit status 1 when a gradient must not be used.\n\n{FAMILY}\n{SETTINGS}", "Is it right?",
+        f"Exit status 1 when a gradient must not be used.\n\n{FAMILY}\n{SETTINGS}",
+        "Is it right?",
     ),
     "examine": Verb(
-        _examine, "examine FILE:COST [key=value ...]", "your own simulator: its gradient, jumps, and what to use",
-        f"{EXAMINE}\n{FAMILY}", "Is it right?",
+        _examine,
+        "examine FILE:COST [key=value ...]",
+        "your own simulator: its gradient, jumps, and what to use",
+        f"{EXAMINE}\n{FAMILY}",
+        "Is it right?",
     ),
     "trace": Verb(
-        _trace, "trace SCENE ... [key=value ...]", "one rollout: do gradient spikes coincide with contact switches?",
-        f"Without noise, or with seed=S the first sample of that seed.\n{SETTINGS}", "Is it right?",
+        _trace,
+        "trace SCENE ... [key=value ...]",
+        "one rollout: do gradient spikes coincide with contact switches?",
+        f"Without noise, or with seed=S the first sample of that seed.\n{SETTINGS}",
+        "Is it right?",
     ),
     "claims": Verb(
-        _main_of("bench.claims"), "claims [NAME ...] [--list] [--quick] [--again] [results_dir=DIR]", "published results run again, each with a verdict",
+        _main_of("bench.claims"),
+        "claims [NAME ...] [--list] [--quick] [--again] [results_dir=DIR]",
+        "published results run again, each with a verdict",
         "Results stored under results_dir/claims are measured again only if their code has changed, or with --again.\n"
         "--quick: only claims that take less than 5 s. plugins=DIR: claims of your own.\n"
         "Exit status 1 when a claim is not reproduced.\n",
     ),
     "compare": Verb(
-        _main_of("bench.compare.command"), "compare BEFORE AFTER [again=DIR,DIR] [out=DIR]", "two results, cell by cell; status 1 if a cell got worse",
+        _main_of("bench.compare.command"),
+        "compare BEFORE AFTER [again=DIR,DIR] [out=DIR]",
+        "two results, cell by cell; status 1 if a cell got worse",
         "BEFORE and AFTER are directories, or git revisions as REV or REV:PATH. Errors decide, paired on equal noise. Times\n"
         "decide only with again=DIR,DIR: further runs of BEFORE, whose spread they are compared with.\n"
         "Written to out=DIR (runs/compare): compare.csv and .md.\n",
     ),
     "index": Verb(
-        _main_of("bench.report.index"), "index [DIR]", "a page over all experiments of a results folder, with the state of each",
+        _main_of("bench.report.index"),
+        "index [DIR]",
+        "a page over all experiments of a results folder, with the state of each",
         "DIR is results by default. Written to DIR/index.html. Nothing is simulated.\n",
     ),
     "history": Verb(
-        _main_of("bench.compare.history"), "history DIR DIR ... [out=DIR]", "the error of each estimator over versions, as a chart and a table",
+        _main_of("bench.compare.history"),
+        "history DIR DIR ... [out=DIR]",
+        "the error of each estimator over versions, as a chart and a table",
         "Directories or git revisions, the oldest first. Written to out=DIR (runs/history): history.png, .csv and .md.\n",
     ),
-}  # fmt: skip
+}

@@ -97,12 +97,16 @@ def rollouts_table() -> str:
         "| microseconds of one thread per rollout | 1,000 | 10,000 | 100,000 | 1,000,000 | times the C loop |",
         "|---" + "|--:" * 5 + "|",
     ]
-    return block(head + [
-        f"| {name} | " + " | ".join([*map(number, values), *[""] * (4 - len(values))])
-        + f" | {span(over_c(what)) if is_same else ''} |"
-        for name, what, is_same in lines
-        for values in [speed(f"{what}, * rollouts")]
-    ])  # fmt: skip
+    return block(
+        head
+        + [
+            f"| {name} | "
+            + " | ".join([*map(number, values), *[""] * (4 - len(values))])
+            + f" | {span(over_c(what)) if is_same else ''} |"
+            for name, what, is_same in lines
+            for values in [speed(f"{what}, * rollouts")]
+        ]
+    )
 
 
 def overhead_table() -> str:
@@ -133,8 +137,13 @@ def dose(table: str, name: str = "dose_response") -> pd.DataFrame:
 
 
 UPDATES = (
-    "random error 0.3", "random error 1", "random error 3", "random error 3 / 0.3", "bias 0.9", "bias 0.9 / random error 1",
-)  # fmt: skip
+    "random error 0.3",
+    "random error 1",
+    "random error 3",
+    "random error 3 / 0.3",
+    "bias 0.9",
+    "bias 0.9 / random error 1",
+)
 ROLLOUTS = "first order / zeroth order, gradient "
 
 
@@ -144,9 +153,13 @@ def dose_ratios(head: str, parts: dict[str, pd.DataFrame], names: dict[str, str]
     for label, part in parts.items():
         rows = part.query("target == 100").set_index("comparison").reindex(list(names.values()))
         cells = [
-            "-" if np.isnan(row.ratio) else number(row.ratio) if row.scenes < LEAST_SCENES else
-            text_of_interval(row.ratio, row.ratio_low, row.ratio_high, 1.0) for row in rows.itertuples()
-        ]  # fmt: skip
+            "-"
+            if np.isnan(row.ratio)
+            else number(row.ratio)
+            if row.scenes < LEAST_SCENES
+            else text_of_interval(row.ratio, row.ratio_low, row.ratio_high, 1.0)
+            for row in rows.itertuples()
+        ]
         lines.append(f"| {label} | {rows['scenes'].max():.0f} | {' | '.join(cells)} |")
     return block(lines)
 
@@ -269,10 +282,14 @@ def effort_share() -> str:
 
 
 MAIN = {
-    "plain": "plain", "difference": "plain_difference", "fobg": "fobg", "pairs": "fobg[mirrored=true]",
-    "reinforce": "reinforce[mirrored=true]", "smoothing": "randomized_smoothing",
+    "plain": "plain",
+    "difference": "plain_difference",
+    "fobg": "fobg",
+    "pairs": "fobg[mirrored=true]",
+    "reinforce": "reinforce[mirrored=true]",
+    "smoothing": "randomized_smoothing",
     "orthogonal": "randomized_smoothing[draws=orthogonal]",
-}  # fmt: skip
+}
 """The estimators in README's table by the names of their figures. Numpy's differences have an error of their own beyond the limit."""
 NEAR = 'stiffness_sweep/verdicts | method!="fobg (numpy)", problem="pushing, penalty, descent='
 PLACES = {"start": '0", at<=3000', "later": '0.9", at<=3000', "beyond": '0", at=10000'}

@@ -59,15 +59,33 @@ def results(stiffness, sigma, samples, repeats, seed, estimator, backend, contac
     norm = 4.0
     time = SPEED.get(backend, 1e-3) * (n / 100) ** 0.9 * (1.0 if first else 0.4)
     return {
-        "status": "ok", "device": "cpu",
-        "reference_norm": norm, "grad_norm": norm * (1 + bias), "reference_method": "quadrature",
-        "reference_se": 0.0, "bias": norm * bias, "bias_low": norm * low, "bias_high": norm * high, "bias_rel": bias,
-        "variance": norm**2 * variance, "variance_low": norm**2 * variance * 0.6, "variance_high": norm**2 * variance * 1.8,
-        "variance_per_sample": norm**2 * variance * n, "rmse": norm * math.hypot(bias, math.sqrt(variance)),
-        "rmse_rel": math.hypot(bias, math.sqrt(variance)), "cosine": 1 / math.sqrt(1 + bias**2 + variance),
-        "sign_agreement": 0.9, "finite_fraction": 1.0, "time_s": time, "time_iqr_s": 0.15 * time, "compile_s": 0.3,
-        "rollouts": n, "gradients": n if first else 0, "peak_memory_mb": 300.0, "versions": "numpy=2.4",
-    }  # fmt: skip
+        "status": "ok",
+        "device": "cpu",
+        "reference_norm": norm,
+        "grad_norm": norm * (1 + bias),
+        "reference_method": "quadrature",
+        "reference_se": 0.0,
+        "bias": norm * bias,
+        "bias_low": norm * low,
+        "bias_high": norm * high,
+        "bias_rel": bias,
+        "variance": norm**2 * variance,
+        "variance_low": norm**2 * variance * 0.6,
+        "variance_high": norm**2 * variance * 1.8,
+        "variance_per_sample": norm**2 * variance * n,
+        "rmse": norm * math.hypot(bias, math.sqrt(variance)),
+        "rmse_rel": math.hypot(bias, math.sqrt(variance)),
+        "cosine": 1 / math.sqrt(1 + bias**2 + variance),
+        "sign_agreement": 0.9,
+        "finite_fraction": 1.0,
+        "time_s": time,
+        "time_iqr_s": 0.15 * time,
+        "compile_s": 0.3,
+        "rollouts": n,
+        "gradients": n if first else 0,
+        "peak_memory_mb": 300.0,
+        "versions": "numpy=2.4",
+    }
 
 
 # ------------------------------------------------------------------------------------------------ from real cells
@@ -114,10 +132,22 @@ def stored(name, *words):
 def row(**values):
     """Return a made-up row with these columns and the ``parameters`` they imply. Its plugins need not exist."""
     given = {
-        "scene": "pushing", "contact": "penalty", "integrator": "semi_implicit_euler", "backend": "jax",
-        "estimator": "fobg", "noise": "action", "horizon": 20, "dt": 0.01, "stiffness": 1e3, "sigma": 0.1,
-        "samples": 100, "repeats": 32, "dim": 20, "seed": 0, "dtype": "float64",
-    } | values  # fmt: skip
+        "scene": "pushing",
+        "contact": "penalty",
+        "integrator": "semi_implicit_euler",
+        "backend": "jax",
+        "estimator": "fobg",
+        "noise": "action",
+        "horizon": 20,
+        "dt": 0.01,
+        "stiffness": 1e3,
+        "sigma": 0.1,
+        "samples": 100,
+        "repeats": 32,
+        "dim": 20,
+        "seed": 0,
+        "dtype": "float64",
+    } | values
     numbers = {name: given[name] for name in ("stiffness", "sigma", "samples", "repeats", "seed")}
     made = results(**numbers, estimator=given["estimator"], backend=given["backend"], contact=given["contact"])
     named = {"experiment": "made_up", "study": "bias_variance"}

@@ -12,8 +12,14 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = [
-    "scenes=[heaviside]", "backends=[numpy]", "estimators=[fobg,reinforce]", "samples=8", "repeats=4", "name=tiny", "--quiet",
-]  # fmt: skip
+    "scenes=[heaviside]",
+    "backends=[numpy]",
+    "estimators=[fobg,reinforce]",
+    "samples=8",
+    "repeats=4",
+    "name=tiny",
+    "--quiet",
+]
 HIDDEN = ("jax", "jaxlib", "torch", "optimistix", "lineax", "equinox", "mujoco", "numba")
 """Libraries of the extras, which the core does without."""
 

@@ -43,10 +43,14 @@ def results(tmp_path_factory):
 @pytest.fixture(scope="module")
 def rows(results):
     return bench.run(
-        name="notes", scenes=["quadratic"], estimators=["fobg", "reinforce[baseline=none]"], results_dir=results,
+        name="notes",
+        scenes=["quadratic"],
+        estimators=["fobg", "reinforce[baseline=none]"],
+        results_dir=results,
         sweep={"sigma": np.array([0.1, 0.2]), "condition": [np.float64(10.0), np.int64(100)]},
-        scene={"quadratic": {"dimension": 3}}, **TINY,
-    )  # fmt: skip
+        scene={"quadratic": {"dimension": 3}},
+        **TINY,
+    )
 
 
 def test_run_returns_a_row_per_cell_and_writes_everything(rows, results):
@@ -195,7 +199,7 @@ def test_estimate_is_that_of_a_cell(rows):
         (lambda: bench.estimate(bench.problem("quadratic", backend="numpy"), "fob"), "did you mean 'fobg'"),
         (lambda: bench.load("no_such_folder"), "no rows are stored in 'no_such_folder'"),
     ],
-)  # fmt: skip
+)
 def test_bad_names_are_told_with_the_nearest_one(call, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(bench.UserError, match=said):
@@ -219,12 +223,18 @@ def test_what_cannot_work_is_unsupported():
 
 def test_keywords_are_the_settings_of_the_command_line():
     same = [
-        (["samples=8", "sweep.stiffness=[100,1e4]"], {"samples": np.int64(8), "sweep": {"stiffness": np.array([100, 1e4])}}),
+        (
+            ["samples=8", "sweep.stiffness=[100,1e4]"],
+            {"samples": np.int64(8), "sweep": {"stiffness": np.array([100, 1e4])}},
+        ),
         (["estimators=[reinforce[baseline=none]]"], {"estimators": "reinforce[baseline=none]"}),
         (["study=bias_variance[timed_calls=3]"], {"study": "bias_variance[timed_calls=3]"}),
         (["theta=[mass]", "theta0=[0.3]"], {"theta": ("mass",), "theta0": np.array([0.3])}),
-        (["sweep.bound=[null,1.0]", "estimators=[alpha_order]"], {"sweep": {"bound": [None, 1.0]}, "estimators": ["alpha_order"]}),
-    ]  # fmt: skip
+        (
+            ["sweep.bound=[null,1.0]", "estimators=[alpha_order]"],
+            {"sweep": {"bound": [None, 1.0]}, "estimators": ["alpha_order"]},
+        ),
+    ]
     for words, settings in same:
         assert [cell.key for cell in cells(*words)] == [cell.key for cell in cells(**settings)], settings
 

@@ -15,9 +15,14 @@ from bench.experiment import config, grid
 from bench.experiment.columns import IDENTITY
 
 TINY = [
-    "scenes=[heaviside]", "backends=[numpy]", "estimators=[fobg,reinforce]", "samples=8", "repeats=4", "name=tiny",
+    "scenes=[heaviside]",
+    "backends=[numpy]",
+    "estimators=[fobg,reinforce]",
+    "samples=8",
+    "repeats=4",
+    "name=tiny",
     "workers=0",
-]  # fmt: skip
+]
 
 
 def test_run_then_report_then_plan(tmp_path, capsys):
@@ -83,9 +88,11 @@ def test_a_failing_cell_is_a_row_and_exit_status_1(tmp_path):
 
 def test_identity_columns_tell_cells_apart():
     words = [
-        "scenes=[pushing]", "contacts=[impulse,'impulse[time_of_impact=false]','softplus[beta=10,smooths=clip]',softplus]",
-        "backends=[numpy]", "estimators=[reinforce,'reinforce[baseline=none]']",
-    ]  # fmt: skip
+        "scenes=[pushing]",
+        "contacts=[impulse,'impulse[time_of_impact=false]','softplus[beta=10,smooths=clip]',softplus]",
+        "backends=[numpy]",
+        "estimators=[reinforce,'reinforce[baseline=none]']",
+    ]
     table = pd.DataFrame([cell.columns() for cell in grid.cells(config.load(words))])
     assert len(table) == 8
     assert not table.duplicated(list(set(IDENTITY) & set(table))).any()
@@ -109,8 +116,11 @@ def test_help_names_the_experiments_and_fits_80_columns(capsys):
     assert max(map(len, text.splitlines())) <= 80
     family = text.partition("Is it right?")[2].partition("\n\n")[0]
     assert [name for name in ("check ", "gradcheck ", "examine ", "trace ", "compare ") if f"\n  {name}" in family] == [
-        "check ", "gradcheck ", "examine ", "trace "
-    ]  # fmt: skip
+        "check ",
+        "gradcheck ",
+        "examine ",
+        "trace ",
+    ]
 
 
 def test_a_swept_axis_of_the_command_line_replaces_that_of_the_file(capsys):

@@ -130,19 +130,31 @@ def test_plugins_import_only_public_names():
 
 
 HOMONYMS = {
-    "jax", "torch", "numpy", "mujoco",  # libraries
+    "jax",
+    "torch",
+    "numpy",
+    "mujoco",  # libraries
     "mjcf",  # a file format
-    "clipped", "constant", "linear", "plain", "growth", "solver", "engines",  # words of the contracts, of a verb or of English
-}  # fmt: skip
+    "clipped",
+    "constant",
+    "linear",
+    "plain",
+    "growth",
+    "solver",
+    "engines",  # words of the contracts, of a verb or of English
+}
 """Names of plugins that the core uses for something else."""
 NAMED = {
     "api.py": {"penalty", "semi_implicit_euler"},  # defaults of `bench.problem`, as in the configuration
     "cli.py": {"gradient_check", "penalty"},  # the study of a verb, and what it runs on scenes of engines
-    "engines/backend.py": {"penalty", "semi_implicit_euler"},  # what an engine's contacts and steps stand for by default
+    "engines/backend.py": {
+        "penalty",
+        "semi_implicit_euler",
+    },  # what an engine's contacts and steps stand for by default
     "trace/contacts.py": {"implicit"},
     "claims/toolkit.py": {"penalty", "semi_implicit_euler", "fused", "gradient_descent", "reinforce", "fobg"},
     "claims/tables.py": {"fobg", "reinforce", "measure_valued", "randomized_smoothing", "sphere_smoothing"},
-}  # fmt: skip
+}
 """The files that name plugins, and which: defaults of a function or verb, and what claims share."""
 
 

@@ -21,9 +21,12 @@ ROOT = Path(__file__).resolve().parent.parent
 DOCS = {path.name: path.read_text() for path in sorted((ROOT / "docs").glob("*.md"))}
 README = (ROOT / "README.md").read_text()
 PAGES = [
-    ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md",
-    *(ROOT / folder / "README.md" for folder in ("plugins", "conf", "results", "examples/atlas")), *(ROOT / "docs" / name for name in DOCS),
-]  # fmt: skip
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "CHANGELOG.md",
+    *(ROOT / folder / "README.md" for folder in ("plugins", "conf", "results", "examples/atlas")),
+    *(ROOT / "docs" / name for name in DOCS),
+]
 EXAMPLES = dict(re.findall(r"```python\n# (\S+\.py)\n(.*?)```", DOCS["extending.md"] + DOCS["training.md"], re.DOTALL))
 SOFT = "# @package _global_\nscenes: [heaviside]\nbackends: [numpy]\n"
 """The experiment that docs/experiments.md has the reader write."""
@@ -196,10 +199,20 @@ def test_the_kit_runs_in_pytest(folder):
 @pytest.mark.slow
 def test_examples_run_together(folder, tmp_path):
     printed = python(
-        folder, "-m", "bench", "name=mine", "plugins=my_plugins", "scenes=[sliding_mass]", "backends=[numpy,jax]",
-        "estimators=[fobg,clipped_fobg]", "estimator.clipped_fobg.limit=0.5", "scene.sliding_mass.mass=2", "samples=16",
-        "repeats=8", f"results_dir={tmp_path}",
-    )  # fmt: skip
+        folder,
+        "-m",
+        "bench",
+        "name=mine",
+        "plugins=my_plugins",
+        "scenes=[sliding_mass]",
+        "backends=[numpy,jax]",
+        "estimators=[fobg,clipped_fobg]",
+        "estimator.clipped_fobg.limit=0.5",
+        "scene.sliding_mass.mass=2",
+        "samples=16",
+        "repeats=8",
+        f"results_dir={tmp_path}",
+    )
     assert "clipped_fobg[limit=0.5]" in printed
 
 
@@ -213,10 +226,18 @@ def test_the_study_of_the_example_writes_its_table(folder, tmp_path):
 @pytest.mark.slow
 def test_the_trainer_of_the_example_trains(folder, tmp_path):
     python(
-        folder, "-m", "bench", "name=climb", "study=train[starts=8,evaluations=1]", "plugins=my_trainers",
-        "scenes=[cartpole_swing[horizon=20,substeps=1]]", "backends=[jax]", "trainers=[hill_climbing]",
-        "trainer.hill_climbing.steps=6400", f"results_dir={tmp_path}",
-    )  # fmt: skip
+        folder,
+        "-m",
+        "bench",
+        "name=climb",
+        "study=train[starts=8,evaluations=1]",
+        "plugins=my_trainers",
+        "scenes=[cartpole_swing[horizon=20,substeps=1]]",
+        "backends=[jax]",
+        "trainers=[hill_climbing]",
+        "trainer.hill_climbing.steps=6400",
+        f"results_dir={tmp_path}",
+    )
     (row,) = bench.load(tmp_path / "climb").to_dict("records")
     assert row["status"] == "ok"
     assert row["final_return"] > row["first_return"]

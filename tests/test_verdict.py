@@ -70,14 +70,19 @@ class Leaves(SampleMean):
         return problem.grad(theta, w)
 '''
 ENDS = {
-    "exit": "os._exit(0)", "c_exit": "ctypes.CDLL(None).exit(0)", "crash": "ctypes.string_at(0)",
+    "exit": "os._exit(0)",
+    "c_exit": "ctypes.CDLL(None).exit(0)",
+    "crash": "ctypes.string_at(0)",
     "killed": "os.kill(os.getpid(), signal.SIGKILL)",
-}  # fmt: skip
+}
 RUN = ["scenes=[ends]", "backends=[numpy]", "estimators=[fobg]", "timing=false"]
 VERBS = {
-    "run": [*RUN, "workers=0"], "plan": RUN, "list": ["leaves"], "gradcheck": ["ends", "workers=0"],
+    "run": [*RUN, "workers=0"],
+    "plan": RUN,
+    "list": ["leaves"],
+    "gradcheck": ["ends", "workers=0"],
     "trace": ["ends", "backends=[numpy]"],
-}  # fmt: skip
+}
 """Commands that run the plugins in a process of their own."""
 LISTED = {"list": 0, "gradcheck": 1}
 """The status of a verdict on a plugin that calls sys.exit."""
@@ -150,11 +155,21 @@ def test_no_verb_answers_for_a_file_that_ends_its_process(words, ending):
 @pytest.mark.parametrize(
     ("status", "words"),
     [
-        (0, "compare rows rows"), (2, "compare rows nothing"), (2, "compare rows"), (0, "history rows rows"), (2, "history rows"),
-        (0, "index rows"), (2, "index nothing"), (2, "index --all"), (0, "claims --list"), (2, "claims nothing"), (0, "engines"),
-        (2, "engines install nothing"), (2, "engines --all"),
+        (0, "compare rows rows"),
+        (2, "compare rows nothing"),
+        (2, "compare rows"),
+        (0, "history rows rows"),
+        (2, "history rows"),
+        (0, "index rows"),
+        (2, "index nothing"),
+        (2, "index --all"),
+        (0, "claims --list"),
+        (2, "claims nothing"),
+        (0, "engines"),
+        (2, "engines install nothing"),
+        (2, "engines --all"),
     ],
-)  # fmt: skip
+)
 def test_statuses_of_the_other_verbs(status, words, ending, monkeypatch):
     monkeypatch.chdir(ending)
     assert main(words.split()) == status

@@ -149,9 +149,18 @@ def combinations():
     """Yield name, pieces in units of sigma from theta, whether declared continuous, and whether jumps are listed."""
     line = power(1)
     smooth = [
-        [line], [power(2), line], [power(3)], [power(3), power(4, 0.1)], [wave(1.0)], [wave(3.0), line], [growth(0.5)],
-        [growth(1.0), power(1, -1.5)], [bump(1.0, 0.3, 2.0)], [power(1, 0.01), wave(4.0, 0.05)], [power(2, 0.001), power(1, 1e-6)],
-    ]  # fmt: skip
+        [line],
+        [power(2), line],
+        [power(3)],
+        [power(3), power(4, 0.1)],
+        [wave(1.0)],
+        [wave(3.0), line],
+        [growth(0.5)],
+        [growth(1.0), power(1, -1.5)],
+        [bump(1.0, 0.3, 2.0)],
+        [power(1, 0.01), wave(4.0, 0.05)],
+        [power(2, 0.001), power(1, 1e-6)],
+    ]
     kinked = [
         [line, ramp(at, c)]
         for at, c in ((0.5, 5.0), (1.0, -1.0), (2.0, 10.0), (3.0, 33.0), (3.5, 200.0), (4.0, 30.0), (-2.5, 100.0))
@@ -265,9 +274,11 @@ def featured(kind, d, random):
 def smooth(d, random):
     """Return a scene of one to four waves, bumps, powers and exponentials along random lines, and its gradient."""
     makers = (
-        lambda: wave(random.uniform(0.3, 2.0)), lambda: bump(random.normal(), random.uniform(0.5, 2.0), 1.0),
-        lambda: power(int(random.integers(2, 4))), lambda: growth(random.uniform(0.1, 0.7)),
-    )  # fmt: skip
+        lambda: wave(random.uniform(0.3, 2.0)),
+        lambda: bump(random.normal(), random.uniform(0.5, 2.0), 1.0),
+        lambda: power(int(random.integers(2, 4))),
+        lambda: growth(random.uniform(0.1, 0.7)),
+    )
     pieces = [makers[random.integers(4)]() for _ in range(random.integers(1, 5))]
     along = [v / np.linalg.norm(v) for v in random.standard_normal((len(pieces), d))]
     scene = Ridge(pieces, along, random.standard_normal(d), 10 ** random.uniform(-2, 0))
@@ -295,11 +306,16 @@ def features(count=200):
         found = certified(case, 1 << 16)
         is_off = found.is_finite and np.linalg.norm(found.gradient - case.truth) > OFF * found.known().standard_error
         is_wide, is_noted = not case.width <= found.spacing, bool(found.note)
-        rows.append({
-            "costs": group, "cases": True, "off, wider than the spacing": is_off and is_wide and not is_noted,
-            "off, narrower": is_off and not is_wide and not is_noted, "off, with a remark": is_off and is_noted,
-            "right, with a remark": is_noted and not is_off,
-        })  # fmt: skip
+        rows.append(
+            {
+                "costs": group,
+                "cases": True,
+                "off, wider than the spacing": is_off and is_wide and not is_noted,
+                "off, narrower": is_off and not is_wide and not is_noted,
+                "off, with a remark": is_off and is_noted,
+                "right, with a remark": is_noted and not is_off,
+            }
+        )
     table = pd.DataFrame(rows).groupby("costs", sort=False).sum()
     print(table.to_string())
     return int(table.loc[table.index.str.match("d = [12]:"), "off, wider than the spacing"].any())

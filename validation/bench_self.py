@@ -29,16 +29,21 @@ from bench.run.record import machine
 from bench.run.tasks import blank_row
 
 SUBJECTS = (
-    ("fused", "penalty", "grad"), ("jax", "penalty", "grad"), ("torch", "penalty", "grad"), ("numpy", "penalty", "value"),
+    ("fused", "penalty", "grad"),
+    ("jax", "penalty", "grad"),
+    ("torch", "penalty", "grad"),
+    ("numpy", "penalty", "value"),
     ("implicit", "complementarity", "grad"),
-)  # fmt: skip
+)
 """Backend, contact law and method of the rollouts of ``pushing`` that are timed."""
 SCENES = ("pushing", "pendulum", "cartpole", "double_pendulum", "hopper", "bounce_once")
 """Scenes whose gradients ``fused`` and ``jax`` are compared on."""
 SIZES = (1_000, 10_000, 100_000, 1_000_000)
 BY_HAND = {
-    "jax": ("grad", by_hand.jax_gradient), "torch": ("grad", by_hand.torch_gradient), "numpy": ("value", by_hand.numpy_cost),
-}  # fmt: skip
+    "jax": ("grad", by_hand.jax_gradient),
+    "torch": ("grad", by_hand.torch_gradient),
+    "numpy": ("value", by_hand.numpy_cost),
+}
 """Method and program by hand with which a backend is compared."""
 SMALL_SIZES = (1, 16, 100, 1_000, 10_000)
 LEAST_BLOCK, BLOCKS = 0.02, 11
@@ -192,9 +197,12 @@ def python(*words):
 
 
 PARTS = {
-    "backends": measure_backends, "overhead": measure_overhead, "scenes": compare_backends, "sweep": measure_sweep,
+    "backends": measure_backends,
+    "overhead": measure_overhead,
+    "scenes": compare_backends,
+    "sweep": measure_sweep,
     "commands": lambda: measure_commands(100, 500),
-}  # fmt: skip
+}
 
 
 def main(words):

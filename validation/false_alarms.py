@@ -17,9 +17,16 @@ from bench.gradient import FAULTS
 from bench.model import compose, registry
 
 SCENES = (
-    "pendulum", "double_pendulum", "cartpole", "mass_spring", "double_integrator", "stiff_decay", "quadratic",
-    "rosenbrock", "cubic",
-)  # fmt: skip
+    "pendulum",
+    "double_pendulum",
+    "cartpole",
+    "mass_spring",
+    "double_integrator",
+    "stiff_decay",
+    "quadratic",
+    "rosenbrock",
+    "cubic",
+)
 HORIZONS = {1: 8, 30: 8, 300: 5, 1000: 2, 2000: 1, 3000: 1}
 """Numbers of steps, and how many checks of a cycle have each."""
 ELSE = 16

@@ -83,10 +83,14 @@ def tail_cells():
     some = [
         registry.make("estimators", name, values)
         for name, values in (
-            ("fobg", {}), ("reinforce", {}), ("reinforce", {"baseline": "center"}), ("control_variate", {}),
-            ("randomized_smoothing", {}), ("randomized_smoothing", {"variant": "forward"}),
+            ("fobg", {}),
+            ("reinforce", {}),
+            ("reinforce", {"baseline": "center"}),
+            ("control_variate", {}),
+            ("randomized_smoothing", {}),
+            ("randomized_smoothing", {"variant": "forward"}),
         )
-    ]  # fmt: skip
+    ]
     return [
         Cell(cost, bank.Ridge([piece], *one), estimator, repeats, 16)
         for cost, piece in (("exp(x)", bank.growth(1.0)), ("hinge", bank.ramp(2.5, 20.0)))

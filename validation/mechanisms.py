@@ -57,9 +57,12 @@ def separate(x, rtol=1e-4, end=3.0, forgotten=0.0):
     def backward(y, v, by_y, by_v, by_x):
         slope = x[0] * (1 - y * y) * v - y
         return (
-            -v, -slope, -by_v * (2 * x[0] * y * v * (1 - forgotten) + 1), by_y + by_v * x[0] * (1 - y * y),
+            -v,
+            -slope,
+            -by_v * (2 * x[0] * y * v * (1 - forgotten) + 1),
+            by_y + by_v * x[0] * (1 - y * y),
             by_v * (1 - y * y) * v,
-        )  # fmt: skip
+        )
 
     _, _, by_y, by_v, by_x = integrate(backward, (y, v, 2 * y, 1.0, 0.0), end, rtol)
     return np.array([by_x, by_y, by_v])

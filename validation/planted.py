@@ -21,12 +21,30 @@ from bench.model import Problem, registry
 from bench.run import tasks
 from bench.run.session import RunSession
 
-SHORT = ("pushing", "cartpole", "double_pendulum", "pendulum", "hopper", "friction_block", "tossed_box", "mass_spring", "ground_wall", "bouncing_ball")  # fmt: skip
+SHORT = (
+    "pushing",
+    "cartpole",
+    "double_pendulum",
+    "pendulum",
+    "hopper",
+    "friction_block",
+    "tossed_box",
+    "mass_spring",
+    "ground_wall",
+    "bouncing_ball",
+)
 """Scenes whose horizon is set to ten steps."""
 WORDS = (
-    "contacts=[penalty]", "backends=[numpy]", "estimators=[fobg]", "sweep.sigma=[0.1]",
-    "samples=16", "repeats=16", "reference.samples=4096", "reference.tolerance=0.1", "timing=false",
-)  # fmt: skip
+    "contacts=[penalty]",
+    "backends=[numpy]",
+    "estimators=[fobg]",
+    "sweep.sigma=[0.1]",
+    "samples=16",
+    "repeats=16",
+    "reference.samples=4096",
+    "reference.tolerance=0.1",
+    "timing=false",
+)
 
 
 def _scaled(factor, gradient):

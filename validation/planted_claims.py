@@ -45,12 +45,16 @@ def fast_step(original, self, dynamics, state, u, dt):
 
 CLAIMS = {
     "estimators": {
-        "fobg": ("C5", "C6", "C19"), "inverse_variance": ("C19",), "measure_valued": ("C6",), "randomized_smoothing": ("C7",),
-        "reinforce": ("C1", "C5", "C6"), "sphere_smoothing": ("C7",),
+        "fobg": ("C5", "C6", "C19"),
+        "inverse_variance": ("C19",),
+        "measure_valued": ("C6",),
+        "randomized_smoothing": ("C7",),
+        "reinforce": ("C1", "C5", "C6"),
+        "sphere_smoothing": ("C7",),
     },
     "contacts": {"penalty": ("C14", "C18"), "straight_through": ("C15",)},
     "integrators": {"event_driven": ("C13",), "semi_implicit_euler": ("C8", "C13")},
-}  # fmt: skip
+}
 """The claims that use a plugin, by kind and name. `impulse` and `complementarity` have bugs of their own below."""
 
 

@@ -142,17 +142,23 @@ def right_cases():
     yield Case("two bounces", bounces, [0.7, 0.4], complex_step(bounces))
     yield Case("rectifiers", network, START, lambda x: network(x, slope=True))
     yield Case(
-        "at a minimum", lambda x: np.sum((x - start) ** 4 + (x - start) ** 2), START,
+        "at a minimum",
+        lambda x: np.sum((x - start) ** 4 + (x - start) ** 2),
+        START,
         lambda x: 4 * (x - start) ** 3 + 2 * (x - start),
-    )  # fmt: skip
+    )
     yield Case(
-        "at the origin", lambda x: np.expm1(x[0]) - np.sin(x[1]) * 1e-6, [0.0, 0.0],
+        "at the origin",
+        lambda x: np.expm1(x[0]) - np.sin(x[1]) * 1e-6,
+        [0.0, 0.0],
         lambda x: [np.exp(x[0]), -np.cos(x[1]) * 1e-6],
-    )  # fmt: skip
+    )
     yield Case(
-        "steep wall", lambda x: np.log1p(np.exp(300 * (x[0] - x[1]))) / 300 + x[0] ** 2, [0.4, 0.38],
+        "steep wall",
+        lambda x: np.log1p(np.exp(300 * (x[0] - x[1]))) / 300 + x[0] ** 2,
+        [0.4, 0.38],
         lambda x: np.array([1.0, -1.0]) / (1 + np.exp(-300 * (x[0] - x[1]))) + [2 * x[0], 0.0],
-    )  # fmt: skip
+    )
 
 
 # ------------------------------------------------------------------------------------------------ torch

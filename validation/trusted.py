@@ -388,11 +388,18 @@ FAMILIES = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text())
 def scenes():
     """Return every scene."""
     return [
-        Scene(part, one["cost"], str(given), globals()[one["cost"]](*given), tuple(one["theta"]) * one.get("times", 1), one["sigma"])
+        Scene(
+            part,
+            one["cost"],
+            str(given),
+            globals()[one["cost"]](*given),
+            tuple(one["theta"]) * one.get("times", 1),
+            one["sigma"],
+        )
         for part, every in FAMILIES.items()
         for one in every
         for given in one["given"]
-    ]  # fmt: skip
+    ]
 
 
 PLUGIN = '''"""The scenes of trusted.py as a plugin, so that `gradcheck` runs on them as a user runs it."""
@@ -432,10 +439,12 @@ def refused(seed, folder, parts):
         rows = pd.read_parquet(Path(results) / "gradcheck" / "rows.parquet")
     return {
         json.loads(row.parameters)["scene"]["index"]: ", ".join(
-            f"{verdict} ({point})" for point, verdict in zip(row.point, row.check_verdict, strict=True) if not is_trusted(point, verdict)
+            f"{verdict} ({point})"
+            for point, verdict in zip(row.point, row.check_verdict, strict=True)
+            if not is_trusted(point, verdict)
         )
         for row in rows.itertuples()
-    }  # fmt: skip
+    }
 
 
 @cache

@@ -42,8 +42,17 @@ PAIRS = {
     ),
 }
 TERMS = (
-    "v*abs(v)", "v**3", "sign(v)", "q**2", "q**3", "1", "v*q**2", "abs(q)", "cos(3*q)", "hysteresis",
-)  # fmt: skip
+    "v*abs(v)",
+    "v**3",
+    "sign(v)",
+    "q**2",
+    "q**3",
+    "1",
+    "v*q**2",
+    "abs(q)",
+    "cos(3*q)",
+    "hysteresis",
+)
 """Accelerations; those after the constant are in no list of the study, but hysteresis."""
 NOISES = {
     "normal": lambda random, size: random.standard_normal(size),
@@ -141,8 +150,11 @@ def main(records: int = 40) -> None:
             kind = name.partition(":")[0]
             most = np.nan if kind.startswith("noise") else limit(pair, clean)
             lines.append([kind, pair, name, shares[0], most, *shares[1:]])
-            print(f"{pair:9}{name:18} not explained {shares[0]:6.1%} (at most {most:6.1%}), intervals hold: plain "
-                  f"{shares[1]:6.1%}, printed {shares[2]:6.1%}; silent and wrong {shares[3]:6.1%}", flush=True)  # fmt: skip
+            print(
+                f"{pair:9}{name:18} not explained {shares[0]:6.1%} (at most {most:6.1%}), intervals hold: plain "
+                f"{shares[1]:6.1%}, printed {shares[2]:6.1%}; silent and wrong {shares[3]:6.1%}",
+                flush=True,
+            )
     table = pd.DataFrame(lines, columns=["kind", "pair", "case", "noticed", "at most", "plain", "printed", "silent"])
     print((100 * table.groupby("kind", sort=False).mean(numeric_only=True)).round(1).to_string())
 

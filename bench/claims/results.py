@@ -57,8 +57,15 @@ def measure(claim: type[Claim]) -> ClaimResult:
     used = tuple(sorted(toolkit.used))
     decided, seconds = verdict(outcome.figures, outcome.reservation), time.process_time() - started
     return ClaimResult(
-        claim.name, decided, seconds, tuple(outcome.figures), outcome.reservation, outcome.series, key_of(claim, used), used
-    )  # fmt: skip
+        claim.name,
+        decided,
+        seconds,
+        tuple(outcome.figures),
+        outcome.reservation,
+        outcome.series,
+        key_of(claim, used),
+        used,
+    )
 
 
 def key_of(claim: type[Claim], used: tuple[tuple[str, str], ...]) -> str:

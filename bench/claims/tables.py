@@ -25,16 +25,26 @@ from bench.report.text import counted, duration, number
 Results = Sequence[tuple[type[Claim], ClaimResult]]
 TITLE = "Published claims, run again"
 FIGURE = (
-    text("figure"), text("published"), text("origin"), text("measured", label="measured (95%)"), text("status", label="verdict"),
-    Column("resolution", label="would fail at, relative"), text("reason", label="5% not detected for"),
-)  # fmt: skip
+    text("figure"),
+    text("published"),
+    text("origin"),
+    text("measured", label="measured (95%)"),
+    text("status", label="verdict"),
+    Column("resolution", label="would fail at, relative"),
+    text("reason", label="5% not detected for"),
+)
 """Columns of a table of figures for readers."""
 NOTHING = Figure("", "0", math.nan)
 """Stands for the figures of a claim that has none, since its code failed."""
 ESTIMATORS = {
-    "first": "fobg", "pathwise": "fobg", "zeroth": "reinforce", "score": "reinforce", "measure": "measure_valued",
-    "Gaussian": "randomized_smoothing", "sphere": "sphere_smoothing",
-}  # fmt: skip
+    "first": "fobg",
+    "pathwise": "fobg",
+    "zeroth": "reinforce",
+    "score": "reinforce",
+    "measure": "measure_valued",
+    "Gaussian": "randomized_smoothing",
+    "sphere": "sphere_smoothing",
+}
 """First words of the labels of curves that have the look of an estimator, with its name."""
 
 
@@ -50,9 +60,17 @@ def chart(claim: type[Claim], result: ClaimResult) -> Chart | None:
         # a second column has the standard errors of means
         values = pd.DataFrame(np.reshape(series, (len(series), -1))).reindex(columns=[0, 1])
         low, high = (values[0] + side * 1.96 * values[1] for side in (-1, 1))
-        parts.append(pd.DataFrame({
-            "series": label, "x": places, "y": values[0], "low": np.maximum(low, 0.1 * values[0]) if is_log["y"] else low, "high": high,
-        }))  # fmt: skip
+        parts.append(
+            pd.DataFrame(
+                {
+                    "series": label,
+                    "x": places,
+                    "y": values[0],
+                    "low": np.maximum(low, 0.1 * values[0]) if is_log["y"] else low,
+                    "high": high,
+                }
+            )
+        )
         with np.errstate(all="ignore"):
             height = values[0].to_numpy()
             height = np.log(height) if is_log["y"] else height
@@ -62,11 +80,17 @@ def chart(claim: type[Claim], result: ClaimResult) -> Chart | None:
         if estimator := ESTIMATORS.get(re.split(r"\W", label)[0]):
             styles[label] = estimator_style(estimator)
     return Chart(
-        claim.name, pd.concat(parts, ignore_index=True), [Column("x", label=place, log=is_log["x"])],
-        [Column("y", label=claim.quantity, low="low", high="high", log=is_log["y"])], "lines",
-        claim.learned.partition(". ")[0], "series", styles=styles, marks=[Mark(label, value, axis=axis) for axis, value, label in claim.marks],
+        claim.name,
+        pd.concat(parts, ignore_index=True),
+        [Column("x", label=place, log=is_log["x"])],
+        [Column("y", label=claim.quantity, low="low", high="high", log=is_log["y"])],
+        "lines",
+        claim.learned.partition(". ")[0],
+        "series",
+        styles=styles,
+        marks=[Mark(label, value, axis=axis) for axis, value, label in claim.marks],
         subtitle=f"{claim.name}, {claim.source.partition(';')[0]}: {result.verdict}",
-    )  # fmt: skip
+    )
 
 
 def measured_text(value: float, error: float) -> str:
@@ -88,15 +112,25 @@ def figures_table(results: Results) -> pd.DataFrame:
     """Return the table of figures for programs: one row per figure, with every digit."""
     rows = [
         {
-            "claim": claim.name, "lesson": claim.lesson, "source": claim.source, "figure": figure.what,
-            "published": figure.published, "origin": claim.origin, "measured": figure.measured, "standard_error": figure.error,
-            "slack": figure.tolerance, "agrees": figure.agrees, "resolution": figure.detectable_error,
-            "sees_5_percent": figure.is_sensitive, "limited_by": figure.limitation,
-            "verdict": result.verdict, "seconds": round(result.seconds, 2),
+            "claim": claim.name,
+            "lesson": claim.lesson,
+            "source": claim.source,
+            "figure": figure.what,
+            "published": figure.published,
+            "origin": claim.origin,
+            "measured": figure.measured,
+            "standard_error": figure.error,
+            "slack": figure.tolerance,
+            "agrees": figure.agrees,
+            "resolution": figure.detectable_error,
+            "sees_5_percent": figure.is_sensitive,
+            "limited_by": figure.limitation,
+            "verdict": result.verdict,
+            "seconds": round(result.seconds, 2),
         }
         for claim, result in results
         for figure in result.figures or (NOTHING,)
-    ]  # fmt: skip
+    ]
     return pd.DataFrame(rows)
 
 
@@ -104,8 +138,11 @@ def count_verdicts(results: Results) -> str:
     """Return the number of claims per verdict, as text, and how many of each are of figures that their source prints or stores."""
     tally = Counter(result.verdict for _, result in results)
     ours = Counter(result.verdict for claim, result in results if claim.origin == "recomputed")
-    counts = ", ".join(f"{tally[verdict]} {verdict}" + f" ({ours[verdict]} of them with recomputed figures)" * bool(ours[verdict])
-                       for verdict in (*VERDICTS, FAILED) if tally[verdict])  # fmt: skip
+    counts = ", ".join(
+        f"{tally[verdict]} {verdict}" + f" ({ours[verdict]} of them with recomputed figures)" * bool(ours[verdict])
+        for verdict in (*VERDICTS, FAILED)
+        if tally[verdict]
+    )
     return f"{counted(len(results), 'claim')}: {counts}"
 
 

@@ -56,9 +56,12 @@ def native(scene: Scene | str, contact: str = "penalty", integrator: str = "semi
 def function(cost: Callable[[Any, Array], Array], start: Any, sigma: float, continuous: bool = True) -> FunctionScene:
     """Return the scene of a plain cost ``cost(xp, x)`` at theta ``start``, with noise on theta."""
     body = {
-        "name": cost.__name__, "continuous": continuous, "__doc__": cost.__doc__,
-        "theta0": lambda self: np.array(start, dtype=float), "cost": lambda self, xp, x: cost(xp, x),
-    }  # fmt: skip
+        "name": cost.__name__,
+        "continuous": continuous,
+        "__doc__": cost.__doc__,
+        "theta0": lambda self: np.array(start, dtype=float),
+        "cost": lambda self, xp, x: cost(xp, x),
+    }
     scene: Any = dataclass(frozen=True)(type(cost.__name__, (FunctionScene,), body))
     return cast(FunctionScene, scene(sigma=sigma))
 

@@ -54,12 +54,18 @@ def compare_cells(
                 changes[key].append(change)
     known = sides["after"].where(sides["after"]["status"].notna(), sides["before"])
     table = known[[*IDENTITY, *LAST]].assign(
-        **{f"{c.name}_{when}": side[c.name] if c.kind == "number" else side[c.name].astype(object).fillna("") for c in judged for when, side in sides.items()},
+        **{
+            f"{c.name}_{when}": side[c.name] if c.kind == "number" else side[c.name].astype(object).fillna("")
+            for c in judged
+            for when, side in sides.items()
+        },
         **{f"status_{when}": side["status"].fillna("") for when, side in sides.items()},
-        outcome=[min((change.outcome for change in own), key=OUTCOMES.index, default="same") for own in changes.values()],
+        outcome=[
+            min((change.outcome for change in own), key=OUTCOMES.index, default="same") for own in changes.values()
+        ],
         change=["; ".join(change.text for change in own) for own in changes.values()],
         **{WORSE_IN: [[change.subject for change in own if change.outcome == "worse"] for own in changes.values()]},
-    )  # fmt: skip
+    )
     return table[[*FIRST, *both_sides(judged), *LAST, WORSE_IN]].reset_index(drop=True), remarks
 
 

@@ -85,11 +85,19 @@ def compute_history(names: Sequence[str], results: Sequence[Mapping[str, Results
                 logs = _log_ratios(before[error.name], after[error.name]) if error else np.empty(0)
                 pairs = [*zip(before.to_dict("records"), after.to_dict("records"), strict=True)]
                 moves = [distance(column, *pair) for column in vectors for pair in pairs]
-                lines.append({
-                    "result": name, "experiment": experiment, "series": series if first[by].nunique() > 1 else "",
-                    "column": rule_of(error).called if error else "", "error": float(np.exp(logs.mean())) if len(logs) else math.nan,
-                    "cells": len(logs), "moved": max(moves, default=math.nan), "failed": int((~is_ok.loc[of, place]).sum()), "of": len(of),
-                })  # fmt: skip
+                lines.append(
+                    {
+                        "result": name,
+                        "experiment": experiment,
+                        "series": series if first[by].nunique() > 1 else "",
+                        "column": rule_of(error).called if error else "",
+                        "error": float(np.exp(logs.mean())) if len(logs) else math.nan,
+                        "cells": len(logs),
+                        "moved": max(moves, default=math.nan),
+                        "failed": int((~is_ok.loc[of, place]).sum()),
+                        "of": len(of),
+                    }
+                )
     return History(pd.DataFrame(lines), list(names))
 
 
@@ -117,10 +125,13 @@ def write(history: History, out: Path) -> list[Path]:
 def views(history: History) -> Views:
     """Return the table of all series, and small multiples of the series that changed."""
     table = history.table.assign(
-        line=[": ".join(filter(None, pair)) for pair in zip(history.table["experiment"], history.table["series"], strict=True)],
+        line=[
+            ": ".join(filter(None, pair))
+            for pair in zip(history.table["experiment"], history.table["series"], strict=True)
+        ],
         failures=[f"{f} of {n}" for f, n in zip(history.table["failed"], history.table["of"], strict=True)],
         result=history.table["result"].map(_short_names(history.names)),
-    )  # fmt: skip
+    )
     parts = dict(iter(table.groupby("line", sort=False)))
     moved = [name for name, part in parts.items() if _is_changed(part)]
     frame = pd.concat([parts[name] for name in (moved or [*parts])[:PANELS]], ignore_index=True)
@@ -130,13 +141,27 @@ def views(history: History) -> Views:
         if part["failed"].nunique() > 1
     }
     chart = Chart(
-        "history", frame, [text("result", label="")], [ERROR], title=QUESTION, panel="line", panel_notes=failures, height=1.2,
-        marks=[Mark("", 1.0, axis="y")], subtitle=f"{len(moved)} of {len(parts)} series changed",
-    )  # fmt: skip
+        "history",
+        frame,
+        [text("result", label="")],
+        [ERROR],
+        title=QUESTION,
+        panel="line",
+        panel_notes=failures,
+        height=1.2,
+        marks=[Mark("", 1.0, axis="y")],
+        subtitle=f"{len(moved)} of {len(parts)} series changed",
+    )
     columns = [
-        text("result"), text("experiment"), text("series"), replace(ERROR, label="error"), text("column", label="error of"),
-        Column("cells", format="setting"), Column("moved", label="gradient moved"), text("failures", label="failed"),
-    ]  # fmt: skip
+        text("result"),
+        text("experiment"),
+        text("series"),
+        replace(ERROR, label="error"),
+        text("column", label="error of"),
+        Column("cells", format="setting"),
+        Column("moved", label="gradient moved"),
+        text("failures", label="failed"),
+    ]
     return Views([Table("history", table, columns, QUESTION, NOTES, data=history.table)], [chart])
 
 

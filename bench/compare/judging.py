@@ -260,8 +260,12 @@ def _verdict(column: Column, old: Row, new: Row) -> Change | None:
 
 
 RULES: dict[str, Callable[[Column, Row, Row], Change | None]] = {
-    "interval": _size, "spread": _size, "exact": _size, "vector": _vector, "verdict": _verdict,
-}  # fmt: skip
+    "interval": _size,
+    "spread": _size,
+    "exact": _size,
+    "vector": _vector,
+    "verdict": _verdict,
+}
 
 
 def rule_of(column: Column) -> ComparisonRule:

@@ -61,8 +61,9 @@ def judge_times(
     changes = {
         key: Change(
             "worse" if grown > 0 else "better",
-            f"{called} {duration(math.exp(new[key] - grown))} to {duration(math.exp(new[key]))} ({math.exp(grown):.2g} times)", called,
+            f"{called} {duration(math.exp(new[key] - grown))} to {duration(math.exp(new[key]))} ({math.exp(grown):.2g} times)",
+            called,
         )
         for key, grown in growth[growth.abs() > limit].items()
-    }  # fmt: skip
+    }
     return changes, [remark] * bool(n_unjudged)

@@ -124,10 +124,15 @@ class EngineBackend(Backend):
         assert isinstance(scene, MechanicalScene)
         assert isinstance(scene, EngineTwin)
         return {
-            "scene": scene.name, "parameters": values(scene), "backend": values(self), "dt": scene.dt,
-            "horizon": scene.horizon, "mjcf": scene.mjcf(), "contact": {} if law is None else {"name": law.name, **values(law)},
+            "scene": scene.name,
+            "parameters": values(scene),
+            "backend": values(self),
+            "dt": scene.dt,
+            "horizon": scene.horizon,
+            "mjcf": scene.mjcf(),
+            "contact": {} if law is None else {"name": law.name, **values(law)},
             **twin.read(scene.mjcf()),
-        }  # fmt: skip
+        }
 
     @classmethod
     def files(cls) -> list[Path]:

@@ -121,8 +121,12 @@ def run(
         try:
             done = subprocess.run(
                 [python, str(script.__file__), *words],
-                env=environment, text=True, timeout=LIMIT_S, stdout=output, stderr=subprocess.PIPE,
-            )  # fmt: skip
+                env=environment,
+                text=True,
+                timeout=LIMIT_S,
+                stdout=output,
+                stderr=subprocess.PIPE,
+            )
             if done.returncode != runner.WRONG:
                 done.check_returncode()
         except (OSError, subprocess.SubprocessError) as error:
@@ -139,21 +143,36 @@ def run(
 def _page(table: pd.DataFrame) -> str:
     """Return the page: a line per engine, cases by releases, verdicts that changed, and the reasons for what is missing."""
     engines = [
-        [name, versions, *((own["is_right"] == verdict).sum() for verdict in ("True", "False")), f"`{own['command'].iloc[0]}`"]
+        [
+            name,
+            versions,
+            *((own["is_right"] == verdict).sum() for verdict in ("True", "False")),
+            f"`{own['command'].iloc[0]}`",
+        ]
         for (name, versions), own in table.groupby(["engine", "versions"], sort=False)
-    ]  # fmt: skip
+    ]
     release = table["versions"].str.split(";").str[0].where(table["versions"] != "", table["engine"])
     table = table.assign(release=release)  # the engine's first library with its version, or the engine
     told, run = (table[table[name] != ""] for name in ("reason", "case"))
     cases = told["case"].str.cat(told["term"].where(told["is_right"] == "False", ""), sep=" ").str.strip()
     reasons = told.assign(case=cases).drop_duplicates(["release", "case"]).groupby(["release", "reason"])["case"]
     notes = [f"- {', '.join([name, *filter(None, of)])}: {printable(why)[:240]}" for (name, why), of in reasons]
-    return "\n".join([
-        "# Conformance of physics engines", "",
-        *_markdown(["engine", "versions", "right", "not right", "command"], engines), "",
-        "The fewest digits of a case's derivatives. own: compared with the engine's own differences. -: not run. ?: cannot tell.", "",
-        *_by_case(run), "", *_changes(run), "", *notes, "",
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            "# Conformance of physics engines",
+            "",
+            *_markdown(["engine", "versions", "right", "not right", "command"], engines),
+            "",
+            "The fewest digits of a case's derivatives. own: compared with the engine's own differences. -: not run. ?: cannot tell.",
+            "",
+            *_by_case(run),
+            "",
+            *_changes(run),
+            "",
+            *notes,
+            "",
+        ]
+    )
 
 
 def _by_case(run: pd.DataFrame) -> list[str]:

@@ -10,9 +10,20 @@ import numpy as np
 from bench.errors import Unsupported
 
 KNOWN = {
-    "mujoco", "option", "worldbody", "contact", "actuator", "tendon", "geom", "body", "joint", "inertial", "pair", "motor",
+    "mujoco",
+    "option",
+    "worldbody",
+    "contact",
+    "actuator",
+    "tendon",
+    "geom",
+    "body",
+    "joint",
+    "inertial",
+    "pair",
+    "motor",
     "fixed",
-}  # fmt: skip
+}
 """The elements of twins."""
 JOINT = {"name", "type", "axis", "damping", "stiffness"}
 """The attributes of twins' joints."""
@@ -44,11 +55,12 @@ def read(mjcf: str) -> dict[str, Any]:
     moving, planes = slice(1, None), model.geom_type == kinds.mjGEOM_PLANE
     joints = {int(mujoco.mjtJoint.mjJNT_SLIDE): "slide", int(mujoco.mjtJoint.mjJNT_HINGE): "hinge"}
     refusals = {
-        "a body without exactly one slide or hinge": (model.body_jntnum[moving] != 1).any() or {*model.jnt_type} - {*joints},
+        "a body without exactly one slide or hinge": (model.body_jntnum[moving] != 1).any()
+        or {*model.jnt_type} - {*joints},
         "a body with an offset": model.body_pos.any(),
         "shapes other than a sphere per body and a ground": (model.body_geomnum[moving] > 1).any()
         or (model.geom_type[~planes] != kinds.mjGEOM_SPHERE).any(),
-    }  # fmt: skip
+    }
     for reason, is_so in refusals.items():
         if is_so:
             raise Unsupported(f"the twin has {reason}")
@@ -58,14 +70,20 @@ def read(mjcf: str) -> dict[str, Any]:
     )
     nothing = 0.0, np.zeros(3)
     return {
-        "gravity": model.opt.gravity.tolist(), "has_ground": bool(planes.any()),
-        "is_level": not np.any([model.geom_pos[planes, 2], *model.geom_quat[planes, 1:3].T]), "forces": _forces(mujoco, model),
+        "gravity": model.opt.gravity.tolist(),
+        "has_ground": bool(planes.any()),
+        "is_level": not np.any([model.geom_pos[planes, 2], *model.geom_quat[planes, 1:3].T]),
+        "forces": _forces(mujoco, model),
         "bodies": [
             {
-                "parent": int(model.body_parentid[i + 1]) - 1, "joint": joints[model.jnt_type[i]],
-                "axis": model.jnt_axis[i].tolist(), "mass": float(model.body_mass[i + 1]),
-                "com": model.body_ipos[i + 1].tolist(), "inertia": model.body_inertia[i + 1].tolist(),
-                "radius": float(shapes.get(i + 1, nothing)[0]), "centre": shapes.get(i + 1, nothing)[1].tolist(),
+                "parent": int(model.body_parentid[i + 1]) - 1,
+                "joint": joints[model.jnt_type[i]],
+                "axis": model.jnt_axis[i].tolist(),
+                "mass": float(model.body_mass[i + 1]),
+                "com": model.body_ipos[i + 1].tolist(),
+                "inertia": model.body_inertia[i + 1].tolist(),
+                "radius": float(shapes.get(i + 1, nothing)[0]),
+                "centre": shapes.get(i + 1, nothing)[1].tolist(),
             }
             for i in range(n)
         ],
@@ -75,7 +93,7 @@ def read(mjcf: str) -> dict[str, Any]:
                 model.pair_geom1, model.pair_geom2, model.pair_friction, model.pair_dim, strict=True
             )
         ],
-    }  # fmt: skip
+    }
 
 
 def _forces(mujoco: Any, model: Any) -> dict[str, Any]:

@@ -272,8 +272,15 @@ class _Examination:
             repeats=stages.repeats,
             setup=setup,
             spent=Spent(
-                clock.counts["costs"], clock.counts["gradients"], clock.spent, clock.compile_s, clock.elapsed,
-                clock.seconds_per("costs"), clock.seconds_per("gradients"), clock.budget, clock.calls,
+                clock.counts["costs"],
+                clock.counts["gradients"],
+                clock.spent,
+                clock.compile_s,
+                clock.elapsed,
+                clock.seconds_per("costs"),
+                clock.seconds_per("gradients"),
+                clock.budget,
+                clock.calls,
             ),
             check=checked,
             is_complete=stages.is_complete,
@@ -296,7 +303,7 @@ class _Examination:
             ],
             left_out=self.left_out,
             enough=self._enough(),
-        )  # fmt: skip
+        )
 
     def _enough(self) -> tuple[float, float]:
         """Return the numbers of costs and gradients with which nothing is left out, as far as is known."""

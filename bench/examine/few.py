@@ -68,9 +68,16 @@ class FewSteps:
     def _part(self, index: int, program: float) -> Part:
         step, minus, plus = np.array(sorted(self.values[index], reverse=True)).T
         sample = Sample(
-            step, minus, self.centre, plus, program, np.zeros(step.size, bool), scale=float(self.space.scale[index]),
-            unit=self.unit, noise=self.floor,
-        )  # fmt: skip
+            step,
+            minus,
+            self.centre,
+            plus,
+            program,
+            np.zeros(step.size, bool),
+            scale=float(self.space.scale[index]),
+            unit=self.unit,
+            noise=self.floor,
+        )
         noise = ROUNDED / MEASURED * sample.rounding(self.unit) + FLOOR * self.floor / step
         bounds = np.abs(sample.right - sample.left) / 2 + noise
         finite = np.isfinite(bounds)

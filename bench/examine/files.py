@@ -41,24 +41,48 @@ def charts(report: Findings) -> list[Chart]:
     found = []
     if report.check.parts and report.gradient:
         parts = sorted(report.check.parts, key=lambda part: -np.nan_to_num(part.error, nan=np.inf))[:SHOWN]
-        steps = pd.concat([
-            pd.DataFrame({"derivative": report.label(part), "step": part.sample.step / part.sample.scale,
-                          "error": part.sample.errors})
-            for part in parts
-        ])  # fmt: skip
-        found.append(Chart(
-            "steps", steps, [Column("step", label="step, in units of the input's scale", log=True)],
-            [Column("error", label="relative error of the gradient", log=True)], series="derivative",
-            title="The gradient against differences of the cost",
-            text="Falls with the step squared until rounding where the gradient is right; levels off where it is wrong.",
-        ))  # fmt: skip
+        steps = pd.concat(
+            [
+                pd.DataFrame(
+                    {
+                        "derivative": report.label(part),
+                        "step": part.sample.step / part.sample.scale,
+                        "error": part.sample.errors,
+                    }
+                )
+                for part in parts
+            ]
+        )
+        found.append(
+            Chart(
+                "steps",
+                steps,
+                [Column("step", label="step, in units of the input's scale", log=True)],
+                [Column("error", label="relative error of the gradient", log=True)],
+                series="derivative",
+                title="The gradient against differences of the cost",
+                text="Falls with the step squared until rounding where the gradient is right; levels off where it is wrong.",
+            )
+        )
     if report.lines:
-        lines = pd.concat([
-            pd.DataFrame({"line": f"line {i + 1}", "t": line.at, "cost": line.costs}) for i, line in enumerate(report.lines)
-        ])  # fmt: skip
+        lines = pd.concat(
+            [
+                pd.DataFrame({"line": f"line {i + 1}", "t": line.at, "cost": line.costs})
+                for i, line in enumerate(report.lines)
+            ]
+        )
         marks = [
             Mark(f"{b.kind}", b.at, panel=f"line {i + 1}") for i, line in enumerate(report.lines) for b in line.breaks
         ]
-        found.append(Chart("lines", lines, [Column("t", label="t, in sigma")], [Column("cost")], panel="line", marks=marks,
-                           title="The cost on lines through theta"))  # fmt: skip
+        found.append(
+            Chart(
+                "lines",
+                lines,
+                [Column("t", label="t, in sigma")],
+                [Column("cost")],
+                panel="line",
+                marks=marks,
+                title="The cost on lines through theta",
+            )
+        )
     return found

@@ -830,10 +830,16 @@ class Findings:
     def line_rows(self) -> list[dict[str, Any]]:
         """Return a row per line through theta: its jumps and kinks, and the share of the change that the gradient misses."""
         return [
-            {"line": index + 1, "jumps": len(line.jumps), "kinks": len(line.breaks) - len(line.jumps), "share missed by the gradient": line.missed if math.isfinite(line.missed) else "unknown",
-             "staircase": line.steps, "not finite": int((~np.isfinite(line.costs)).sum())}
+            {
+                "line": index + 1,
+                "jumps": len(line.jumps),
+                "kinks": len(line.breaks) - len(line.jumps),
+                "share missed by the gradient": line.missed if math.isfinite(line.missed) else "unknown",
+                "staircase": line.steps,
+                "not finite": int((~np.isfinite(line.costs)).sum()),
+            }
             for index, line in enumerate(self.lines)
-        ]  # fmt: skip
+        ]
 
     def break_rows(self) -> list[dict[str, Any]]:
         """Return a row per jump or kink: line, position in standard deviations, size, and the first numbers of theta there."""

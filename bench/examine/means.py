@@ -119,9 +119,13 @@ def _summary(drawn: np.ndarray, n_noise: int) -> Mean:
         np.array([math.sqrt(max(mean**2 - error**2, 0.0)), 2.0 * error]) / size if size > 0 else [math.inf] * 2
     )
     return Mean(
-        drawn.shape[1], float(distance), float(doubt), all(map(_follows, gradient, small)),
-        jump > CLEAR * jump_error and jump > ALIKE * size, jump + 2.0 * jump_error <= ALIKE * size,
-    )  # fmt: skip
+        drawn.shape[1],
+        float(distance),
+        float(doubt),
+        all(map(_follows, gradient, small)),
+        jump > CLEAR * jump_error and jump > ALIKE * size,
+        jump + 2.0 * jump_error <= ALIKE * size,
+    )
 
 
 def _follows(gradient: np.ndarray, small: np.ndarray) -> bool:

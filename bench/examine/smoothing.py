@@ -235,9 +235,21 @@ def _summary(
             methods.append(_method("mirrored", (low, high), slopes, norm, 2, slope))
         methods.sort(key=lambda m: (math.isnan(m.seconds), m.seconds))
     return Smoothed(
-        sigma, truth / weight[:, 0], error, norm, pairs, bias, low, high, moved, remark, tuple(methods),
-        int((d != 0.0).sum()), n_lost, float(event),
-    )  # fmt: skip
+        sigma,
+        truth / weight[:, 0],
+        error,
+        norm,
+        pairs,
+        bias,
+        low,
+        high,
+        moved,
+        remark,
+        tuple(methods),
+        int((d != 0.0).sum()),
+        n_lost,
+        float(event),
+    )
 
 
 def _terms(u: np.ndarray, d: np.ndarray) -> np.ndarray:

@@ -294,12 +294,16 @@ class GradientStages:
         eps, is_right, is_large = step_sizes(self.simulator.unit), self.check.trusted, self.theta.size > MANY
         has_all = draws >= 0 and (is_right or is_large or draws != FEW)
         return Options(
-            components=size, directions=2 * (draws >= 0), draws=max(draws, 0), unit=self.simulator.unit, seed=self.seed,
+            components=size,
+            directions=2 * (draws >= 0),
+            draws=max(draws, 0),
+            unit=self.simulator.unit,
+            seed=self.seed,
             eps=eps if has_all or eps is not EPS else eps[::2],
             # a wrong gradient is named by its ratios at other thetas first, and then searched for staircases
             scanned=4 if draws == MOST or (is_right and draws >= 0) else 0,
             repeated=is_right and draws >= 0 and self.repeats.spread == 0.0,
-        )  # fmt: skip
+        )
 
     def _cost_of(self, options: Options, size: int) -> tuple[int, int]:
         """Return the numbers of costs and gradients of a stage."""

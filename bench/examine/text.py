@@ -92,8 +92,9 @@ def _costs_under_noise(report: Findings) -> str:
     best = {one.sigma: report.recommended(one) for one in report.smoothed}
     found += [
         f"smoothing has an error of 10% after {method.calls:.0f} calls at sigma {setup.shown(sigma)}"
-        for sigma, method in best.items() if method
-    ] or ["what smoothing needs is not known"]  # fmt: skip
+        for sigma, method in best.items()
+        if method
+    ] or ["what smoothing needs is not known"]
     return f"Under noise of sigma {', '.join(map(setup.shown, setup.sigmas))}: {', '.join(found)}"
 
 
@@ -110,16 +111,25 @@ def warnings(report: Findings) -> list[str]:
     answer = "holds" if report.is_expected else "does not excuse a wrong gradient" * (report.expect == cause)
     found = {
         f"expect={report.expect} {answer or f'does not hold: the cause is {cause}'}": report.expect,
-        f"small error, within the tolerance: {''.join(map(report.numbers, small[:1]))}": small and report.derivative == RIGHT,
-        f"zero: {', '.join(zeros[:MANY])}{' ...' * (len(zeros) > MANY)}": zeros and report.derivative_cause != "constant",
-        **{f"{limit}: errors below about {100 * report.resolution:.1g}% are not seen": holds for limit, holds in limits.items()},
-        f"the gradient raised an exception {report.n_failed} times away from theta: {shortened(report.error)}": report.n_failed and not report.is_failed,
-        f"the cost is not a number or raises an exception, {report.place}": report.derivative_cause != "nonfinite" and report.place,
+        f"small error, within the tolerance: {''.join(map(report.numbers, small[:1]))}": small
+        and report.derivative == RIGHT,
+        f"zero: {', '.join(zeros[:MANY])}{' ...' * (len(zeros) > MANY)}": zeros
+        and report.derivative_cause != "constant",
+        **{
+            f"{limit}: errors below about {100 * report.resolution:.1g}% are not seen": holds
+            for limit, holds in limits.items()
+        },
+        f"the gradient raised an exception {report.n_failed} times away from theta: {shortened(report.error)}": report.n_failed
+        and not report.is_failed,
+        f"the cost is not a number or raises an exception, {report.place}": report.derivative_cause != "nonfinite"
+        and report.place,
         **{f"{name} changes theta in place: each call gets a copy": True for name in report.changing},
         f"cost and gradient printed {counted(len(report.printed), 'line')}; the first: {shortened(''.join(report.printed[:1]))}": report.printed,
-        report.missed_text: not report.status and report.missed > SEEN and report.noise_cause not in ("jumps", "staircase"),
+        report.missed_text: not report.status
+        and report.missed > SEEN
+        and report.noise_cause not in ("jumps", "staircase"),
         **{f"not done within the budget: {what}": True for what in report.left_out},
-    }  # fmt: skip
+    }
     return [text for text, holds in found.items() if holds]
 
 
@@ -183,19 +193,30 @@ def write(report: Findings) -> str:
     ]
     parts = [
         [
-            conclusion(report), noise_answer(report), *(f"  {text}" for text in noise),
-            *(f"since the baseline: {text}" for text in report.changes), *(f"warning: {text}" for text in warnings(report)),
+            conclusion(report),
+            noise_answer(report),
+            *(f"  {text}" for text in noise),
+            *(f"since the baseline: {text}" for text in report.changes),
+            *(f"warning: {text}" for text in warnings(report)),
         ],
         [f"checked: {_checked(report)}", f"not checked: {'; '.join(_unchecked(report))}", f"next: {step}" * bool(step)],
         _head(report),
         table("The derivative, by the program and by differences:", derivatives),
-        table("The gradient after fewer or more steps, error and uncertainty over the largest difference, norm in units of the scales:",
-              [one._asdict() for one in report.explained.growth]),
-        table(f"Lines through theta, +-{REACH:g} sigma (sigma = {report.setup.shown(report.setup.reach)} {unit}):", report.line_rows()),
+        table(
+            "The gradient after fewer or more steps, error and uncertainty over the largest difference, norm in units of the scales:",
+            [one._asdict() for one in report.explained.growth],
+        ),
+        table(
+            f"Lines through theta, +-{REACH:g} sigma (sigma = {report.setup.shown(report.setup.reach)} {unit}):",
+            report.line_rows(),
+        ),
         table("Jumps and kinks on these lines, at t in sigma:", report.break_rows()),
-        table(f"With noise of sigma {unit}, J = E cost; samples, calls and seconds are for an error of 10%:", report.sigma_rows()),
+        table(
+            f"With noise of sigma {unit}, J = E cost; samples, calls and seconds are for an error of 10%:",
+            report.sigma_rows(),
+        ),
         ["The gradient's exception:", f"  {error}"] if len(error) > len(shortened(error)) else [],
-    ]  # fmt: skip
+    ]
     return "\n\n".join("\n".join(filter(None, part)) for part in parts if part)
 
 
@@ -218,7 +239,7 @@ def _unchecked(report: Findings) -> list[str]:
         f"an error of one number in a group below {number(100 * report.hidden)}% of the root mean square of all": report.hidden,
         f"other thetas around this one ({limit})": has_rest,
         "thetas far from this one": True,
-    }  # fmt: skip
+    }
     return [what for what, holds in rest.items() if holds]
 
 
@@ -228,15 +249,21 @@ def _head(report: Findings) -> list[str]:
     point += f", ... ({report.theta.size:,} numbers)" * (report.theta.size > MANY)
     spread = f"equal calls differ by {number(report.repeats.spread)}" if report.repeats.spread else "repeats exactly"
     gradient = report.gradient or "none, only differences"
-    times = {"within the budget": spent.seconds, "first calls": spent.compile_s, "all": spent.elapsed,
-             "a cost": spent.cost_s, "a gradient": spent.gradient_s}  # fmt: skip
+    times = {
+        "within the budget": spent.seconds,
+        "first calls": spent.compile_s,
+        "all": spent.elapsed,
+        "a cost": spent.cost_s,
+        "a gradient": spent.gradient_s,
+    }
     each = [f"{what} {duration(seconds)}" for what, seconds in times.items() if math.isfinite(seconds)]
     counts = counted(spent.costs, "cost"), counted(spent.gradients, "gradient")
     return [
         f"{report.name}: cost {report.cost:.6g} at {point}",
         f"{report.precision}, {spread}, cost noise {number(noise)}, gradient: {gradient}, batch: {report.batch}",
-        f"spent: {', '.join([*counts, *each])}", *(f"note: {note}" for note in report.notes),
-    ]  # fmt: skip
+        f"spent: {', '.join([*counts, *each])}",
+        *(f"note: {note}" for note in report.notes),
+    ]
 
 
 def table(title: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:

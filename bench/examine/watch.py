@@ -35,9 +35,25 @@ LINE = (9, 6, 1)
 FIRST_STEP = 1e-3
 """Length of a step before the first one, in units of the scale of theta."""
 COLUMNS = (
-    "iteration", "cost", "gradient_norm", "verdict", "error", "noise", "ratio", "ratio_low", "ratio_high", "cosine",
-    "cosine_low", "cosine_high", "jumps", "largest_jump", "lowers", "costs", "seconds", "reason",
-)  # fmt: skip
+    "iteration",
+    "cost",
+    "gradient_norm",
+    "verdict",
+    "error",
+    "noise",
+    "ratio",
+    "ratio_low",
+    "ratio_high",
+    "cosine",
+    "cosine_low",
+    "cosine_high",
+    "jumps",
+    "largest_jump",
+    "lowers",
+    "costs",
+    "seconds",
+    "reason",
+)
 LARGER, EARLIER = 200.0, 3
 """Factor on the largest norm of at least this number of earlier checks above which a gradient explodes."""
 MEANINGS = {
@@ -161,8 +177,11 @@ class Watch:
             few.run_round(size, simulator.width)
         checked = few.check()
         row |= {
-            "cost": value, "verdict": checked.cause, "error": max(part.error for part in checked.parts), "noise": noise,
-        }  # fmt: skip
+            "cost": value,
+            "verdict": checked.cause,
+            "error": max(part.error for part in checked.parts),
+            "noise": noise,
+        }
         if np.isfinite(slopes).all():
             has_moved = self._before.size == at.size and (self._before != at).any()
             step = at - self._before if has_moved else FIRST_STEP * scale
@@ -251,9 +270,10 @@ def _along(
     lowered = [share for share, change in zip(SHARES, changes, strict=True) if change < 0.0]
     is_known = bool((changes > rounding).all())
     return {
-        "jumps": len(line.jumps), "largest_jump": max((jump.size for jump in line.jumps), default=0.0),
+        "jumps": len(line.jumps),
+        "largest_jump": max((jump.size for jump in line.jumps), default=0.0),
         "lowers": max(lowered, default=0.0 if is_known else math.nan),
-    }  # fmt: skip
+    }
 
 
 @contextmanager

@@ -165,9 +165,24 @@ def _composed_files(name: str, config_dirs: tuple[Path, ...], stamps: object) ->
 
 
 NEUTRAL = (
-    "experiment", "name", "results_dir", "answer", "compares", "formats", "chart_columns", "compile_cache", "plugins", "workers", "timeout",
-    "memory", "on_error", "ladder", "versions", "retry", "shard",
-)  # fmt: skip
+    "experiment",
+    "name",
+    "results_dir",
+    "answer",
+    "compares",
+    "formats",
+    "chart_columns",
+    "compile_cache",
+    "plugins",
+    "workers",
+    "timeout",
+    "memory",
+    "on_error",
+    "ladder",
+    "versions",
+    "retry",
+    "shard",
+)
 """Settings that decide no result: where others differ from those of its file, the answer of an experiment does not hold."""
 
 

@@ -113,8 +113,7 @@ class Chart:
     def _names(self) -> list[str]:
         """Return the columns of the table that the chart needs."""
         axes = [name for c in (*self.x, *self.y) for name in (c.name, c.low, c.high, c.limit)]
-        names = [self.panel, self.series, self.line, self.level, self.cell,
-                 self.failed, self.arrow, self.limit, *axes]  # fmt: skip
+        names = [self.panel, self.series, self.line, self.level, self.cell, self.failed, self.arrow, self.limit, *axes]
         return [name for name in dict.fromkeys(names) if name]
 
 

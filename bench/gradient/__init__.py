@@ -24,4 +24,4 @@ __all__ = [
     "sampled",
     "settle",
     "step_sizes",
-]  # fmt: skip
+]

@@ -312,9 +312,9 @@ class _Checker:
         chosen = extremes(first * self.scale, options.components)
         lines = [self._along(i, theta, first) for i in chosen]
         parts = self._check_lines([*lines, *self._directions("", theta, first)], is_thorough=True)
-        draws = self._check_lines([
-            line for k, each in enumerate(elsewhere) for line in self._directions(f"other theta {k} ", *each)
-        ])  # fmt: skip
+        draws = self._check_lines(
+            [line for k, each in enumerate(elsewhere) for line in self._directions(f"other theta {k} ", *each)]
+        )
         parts, draws = self._with_causes(parts, draws, elsewhere)
         others = []
         if not np.isfinite(first).all() and np.isfinite(self.cost(theta[:, None])).all():
@@ -355,9 +355,18 @@ class _Checker:
         # a component this much smaller than the others may be only their rounding, unless it is exactly 0
         doubts = np.where(program != 0.0, np.sqrt(self.unit) * largest / lengths, 0.0)
         samples, minus, plus = sampled(
-            self.cost, thetas, vectors, lengths, program, self.unit, self.options.eps, self._modes,
-            is_thorough and self.options.repeated, doubts, np.abs(vectors).T @ self._moved / lengths,
-        )  # fmt: skip
+            self.cost,
+            thetas,
+            vectors,
+            lengths,
+            program,
+            self.unit,
+            self.options.eps,
+            self._modes,
+            is_thorough and self.options.repeated,
+            doubts,
+            np.abs(vectors).T @ self._moved / lengths,
+        )
         if self._gradient is None:
             samples = [replace(sample, derivative=judge(sample).difference) for sample in samples]
         parts = [

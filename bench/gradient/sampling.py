@@ -58,10 +58,19 @@ def sampled(
         with np.errstate(over="ignore", invalid="ignore"):
             measured = noise(row[2 * count + 1 :].reshape(2, POINTS))
             sample = Sample(
-                eps * lengths[m], row[:count], float(row[2 * count]), row[count : 2 * count], float(derivatives[m]),
-                minus_modes[m] != plus_modes[m], bool(repeatable[m]), float(lengths[m]), unit, measured,
-                0.0 if doubts is None else float(doubts[m]), 0.0 if moved is None else float(moved[m]),
-            )  # fmt: skip
+                eps * lengths[m],
+                row[:count],
+                float(row[2 * count]),
+                row[count : 2 * count],
+                float(derivatives[m]),
+                minus_modes[m] != plus_modes[m],
+                bool(repeatable[m]),
+                float(lengths[m]),
+                unit,
+                measured,
+                0.0 if doubts is None else float(doubts[m]),
+                0.0 if moved is None else float(moved[m]),
+            )
             result.append(replace(sample, noise=max(measured, scatter(sample.step, sample.differences))))
     return result, minus_modes, plus_modes
 

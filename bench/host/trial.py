@@ -84,9 +84,12 @@ def _try_imports(names: Sequence[str], packages: Mapping[str, Path], timeout_s: 
     content = json.dumps(job | {"modules": list(names), "timeout_s": timeout_s}).encode()
     with guard.temporary_file() as output:
         process = subprocess.Popen(
-            [sys.executable, "-c", CHILD_CODE], stdin=subprocess.PIPE, stdout=output, stderr=subprocess.DEVNULL,
+            [sys.executable, "-c", CHILD_CODE],
+            stdin=subprocess.PIPE,
+            stdout=output,
+            stderr=subprocess.DEVNULL,
             start_new_session=True,
-        )  # fmt: skip
+        )
         try:
             process.communicate(content)
         finally:

@@ -14,6 +14,19 @@ from bench.model import *  # noqa: F403
 from bench.model import __all__ as _contracts
 
 __all__ = [
-    *_contracts, "COMMON", "Cell", "Chart", "Column", "Columns", "ComparisonRule", "EngineBackend", "Experiment", "Mark", "Session", "Study",
-    "Style", "Table", "Views",
-]  # fmt: skip
+    *_contracts,
+    "COMMON",
+    "Cell",
+    "Chart",
+    "Column",
+    "Columns",
+    "ComparisonRule",
+    "EngineBackend",
+    "Experiment",
+    "Mark",
+    "Session",
+    "Study",
+    "Style",
+    "Table",
+    "Views",
+]

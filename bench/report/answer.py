@@ -23,8 +23,13 @@ from bench.report.text import duration, interval, listed, number
 REFERENCE = re.compile(r"\{([^{}]*)\}")
 CONDITION = re.compile(r'\s*([^,=<>!]+?)\s*(<=|>=|!=|=|<|>)\s*("[^"]*"|[^,]*)\s*(?:,|$)')
 OPERATORS: dict[str, Callable[[Any, Any], Any]] = {
-    "=": operator.eq, "!=": operator.ne, "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,
-}  # fmt: skip
+    "=": operator.eq,
+    "!=": operator.ne,
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+}
 
 
 def fill(text: str, table: Callable[[str], pd.DataFrame]) -> str:

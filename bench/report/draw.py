@@ -101,9 +101,13 @@ def draw(chart: Chart, is_narrow: bool = False) -> Figure:
     figure = Figure(figsize=(width, 4 + 2 * sum(ratios)), layout=engine)
     FigureCanvasAgg(figure)
     grid = figure.subplots(
-        down, across, squeeze=False, sharey=is_plot and (shared or (chart.across > 1 and "row")), height_ratios=ratios,
+        down,
+        across,
+        squeeze=False,
+        sharey=is_plot and (shared or (chart.across > 1 and "row")),
+        height_ratios=ratios,
         sharex=stacked or (not chart.own_scales and chart.kind == "dots"),
-    ).ravel()  # fmt: skip
+    ).ravel()
     for spare in grid[len(panels) :]:
         spare.remove()
     for place, (panel, (name, part, y), names) in enumerate(zip(grid, panels, rows, strict=False)):
@@ -171,9 +175,17 @@ def _frame(figure: Figure, chart: Chart, first: Sequence[str]) -> None:
     if drawn:
         labels = [_wrapped(name, width - 0.6) for name in names]
         figure.legend(
-            [drawn[name] for name in names], labels, loc="outside lower center", ncols=_legend_columns(labels, width),
-            frameon=False, fontsize=SIZE, columnspacing=1.2, handletextpad=0.5, labelspacing=0.25, borderaxespad=0.1,
-        )  # fmt: skip
+            [drawn[name] for name in names],
+            labels,
+            loc="outside lower center",
+            ncols=_legend_columns(labels, width),
+            frameon=False,
+            fontsize=SIZE,
+            columnspacing=1.2,
+            handletextpad=0.5,
+            labelspacing=0.25,
+            borderaxespad=0.1,
+        )
 
 
 def _wrapped(text: str, width: float, ends: str = r" ,/\[") -> str:
@@ -362,12 +374,29 @@ def _draw_values(
         label = f"{number(given[last])} {'→' if is_flat else '↑'}"
         at, shift = ((1, places[last]), (2, -3)) if is_flat else ((places[last], 1), (0, 2 + CUT * len(cuts)))
         if label not in cuts:
-            panel.annotate(label, at, shift, xycoords=edge, textcoords="offset points", color=style.colour, gid="cut",
-                           ha="left" if is_flat else "center", annotation_clip=False)  # fmt: skip
+            panel.annotate(
+                label,
+                at,
+                shift,
+                xycoords=edge,
+                textcoords="offset points",
+                color=style.colour,
+                gid="cut",
+                ha="left" if is_flat else "center",
+                annotation_clip=False,
+            )
     if lost.any():
         _name(panel, chart.failed_name, marker="x")
-        plot(places[lost], (given[lost] != 0) * (1.0 if is_flat else 0.97), marker="x", linestyle="none", transform=edge, markersize=5,
-             markeredgewidth=1.4, clip_on=False)  # fmt: skip
+        plot(
+            places[lost],
+            (given[lost] != 0) * (1.0 if is_flat else 0.97),
+            marker="x",
+            linestyle="none",
+            transform=edge,
+            markersize=5,
+            markeredgewidth=1.4,
+            clip_on=False,
+        )
 
 
 # ----------------------------------------------------------------------------------------------- dots and grids

@@ -37,8 +37,13 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     charts = [Chart(experiment.study.name, frame, x[:1], y[:1], "points", series="series")] if x and y else []
     return Views(
         tables=[
-            Table(experiment.study.name, table, [*labels, *swept, *(replace(c, digits=3) for c in own), COMMON["status"]],
-                  data=axes.table(experiment, rows), terminal=True)
+            Table(
+                experiment.study.name,
+                table,
+                [*labels, *swept, *(replace(c, digits=3) for c in own), COMMON["status"]],
+                data=axes.table(experiment, rows),
+                terminal=True,
+            )
         ],
         charts=charts,
-    )  # fmt: skip
+    )

@@ -71,9 +71,11 @@ def _card(folder: Path, place: Path) -> str:
     record, texts = read_object(place / "run.json"), _texts(place)
     name, page, chart = texts.get("experiment", place.name), _page(place), _chart(place, texts.get("chart", ""))
     state, when = _state(place / "rows.parquet", record.get("counts"), texts.get("finished", ""))
-    parts = ['<div class="none">no chart</div>'] if chart is None else [
-        f'<img src="{_link(folder, chart)}" alt="{escape(f"The chart {chart.stem} of {name}")}" loading="lazy">'
-    ]  # fmt: skip
+    parts = (
+        ['<div class="none">no chart</div>']
+        if chart is None
+        else [f'<img src="{_link(folder, chart)}" alt="{escape(f"The chart {chart.stem} of {name}")}" loading="lazy">']
+    )
     parts.append(f"<h2>{escape(name)}</h2>")
     for look, text in (
         ("hint", escape(texts.get("question", ""))),

@@ -53,11 +53,22 @@ def _blocks(table: Table) -> Iterable[tuple[int, str]]:
                 [name, *(_in_latex(cell(column, row)) for column in shown)]
                 for name, row in zip(names, rows, strict=True)
             ]
-            yield 4 + 2 * len(rows), "\n".join([
-                rf"\par\medskip {escape_latex(heading or table.title)}\par\nopagebreak\smallskip", FIT,
-                rf"\begin{{tabular}}{{@{{}}l{'c' * len(shown)}@{{}}}}", r"\toprule", heads + r" \\", r"\midrule",
-                *(" & ".join(line) + r" \\" for line in lines), r"\bottomrule", r"\end{tabular}}\par",
-            ])  # fmt: skip
+            yield (
+                4 + 2 * len(rows),
+                "\n".join(
+                    [
+                        rf"\par\medskip {escape_latex(heading or table.title)}\par\nopagebreak\smallskip",
+                        FIT,
+                        rf"\begin{{tabular}}{{@{{}}l{'c' * len(shown)}@{{}}}}",
+                        r"\toprule",
+                        heads + r" \\",
+                        r"\midrule",
+                        *(" & ".join(line) + r" \\" for line in lines),
+                        r"\bottomrule",
+                        r"\end{tabular}}\par",
+                    ]
+                ),
+            )
 
 
 def _in_latex(one: TableCell) -> str:

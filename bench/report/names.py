@@ -89,7 +89,9 @@ def in_words(chart: Chart) -> Chart:
     frame = chart.frame.assign(**{name: given[name].map(names) for name, names in short.items()})
     series, panels = short.get(chart.series, {}), short.get(chart.panel, {})
     return replace(
-        chart, frame=frame, styles={series.get(name, name): style for name, style in chart.styles.items()},
+        chart,
+        frame=frame,
+        styles={series.get(name, name): style for name, style in chart.styles.items()},
         panel_notes={panels.get(name, name): note for name, note in chart.panel_notes.items()},
         marks=[replace(mark, panel=panels.get(mark.panel or "", mark.panel)) for mark in chart.marks],
-    )  # fmt: skip
+    )

@@ -41,7 +41,7 @@ def joined(values: Mapping[Any, Any]) -> str:
     texts = (
         value if isinstance(value, str) else f"{name}={axis_value(value)}" if math.isfinite(value) else ""
         for name, value in values.items()
-    )  # fmt: skip
+    )
     return ", ".join(text for text in texts if text not in ("", "none"))
 
 

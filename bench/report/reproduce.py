@@ -32,7 +32,7 @@ def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
     return [
         [*head, *settings[text], *(f"{name}={count}" for name, count in line.items())] if settings[text] else []
         for text, line in zip(given, counts, strict=True)
-    ]  # fmt: skip
+    ]
 
 
 def _settings(given: Mapping[str, Any], timing: bool) -> list[str]:

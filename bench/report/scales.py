@@ -12,8 +12,17 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from bench.report.text import axis_value
 
 TICKS = (
-    (1, (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8)), (1, (1, 1.5, 2, 3, 5, 7)), (1, (1, 2, 5)), (1, (1, 3)), (1, (1,)), (2, (1,)), (3, (1,)), (4, (1,)), (6, (1,)), (10, (1,))
-)  # fmt: skip
+    (1, (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8)),
+    (1, (1, 1.5, 2, 3, 5, 7)),
+    (1, (1, 2, 5)),
+    (1, (1, 3)),
+    (1, (1,)),
+    (2, (1,)),
+    (3, (1,)),
+    (4, (1,)),
+    (6, (1,)),
+    (10, (1,)),
+)
 """Choices of ticks on a logarithmic axis, finest first: a stride in decades, and the positions within a decade."""
 
 SMALLEST, LARGEST = 1e-250, 1e250

@@ -66,9 +66,14 @@ class Shown:
         labels = label_columns(self.arranged, self.parts, self.over, always=always, rows=rows)
         heads = [COMMON.get(name, Column(name, format="setting")) for name in labels]
         return Table(
-            self.experiment.study.name, rows, [*heads, *shown, COMMON["status"]], title, notes, terminal=terminal,
+            self.experiment.study.name,
+            rows,
+            [*heads, *shown, COMMON["status"]],
+            title,
+            notes,
+            terminal=terminal,
             data=axes.table(self.experiment, self.stored),
-        )  # fmt: skip
+        )
 
 
 def stacked(frame: pd.DataFrame, series: Mapping[str, str], value: str) -> pd.DataFrame:

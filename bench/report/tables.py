@@ -41,15 +41,31 @@ def escape_markdown(text: str) -> str:
 
 
 SIGNS = {
-    "∞": r"$\infty$", "↑": r"$\uparrow$", "⧗": r"$\ominus$", "†": r"\dag", "‡": r"\ddag", "–": "--", "∅": r"$\emptyset$",
-}  # fmt: skip
+    "∞": r"$\infty$",
+    "↑": r"$\uparrow$",
+    "⧗": r"$\ominus$",
+    "†": r"\dag",
+    "‡": r"\ddag",
+    "–": "--",
+    "∅": r"$\emptyset$",
+}
 """LaTeX for the signs of failed cells."""
 
 
 def escape_latex(text: str) -> str:
     """Return text escaped so that LaTeX prints it verbatim."""
-    special = SIGNS | {c: rf"\{c}" for c in "&%$#_{}"} | {
-        "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": "$<$", ">": "$>$",
-        "|": "$|$", "[": "{[}", "]": "{]}",
-    }  # fmt: skip
+    special = (
+        SIGNS
+        | {c: rf"\{c}" for c in "&%$#_{}"}
+        | {
+            "\\": r"\textbackslash{}",
+            "~": r"\textasciitilde{}",
+            "^": r"\textasciicircum{}",
+            "<": "$<$",
+            ">": "$>$",
+            "|": "$|$",
+            "[": "{[}",
+            "]": "{]}",
+        }
+    )
     return "".join(special.get(c, c) for c in one_line(text))

@@ -71,6 +71,11 @@ def launcher_of(experiment: Experiment, timed: bool = False) -> Launcher:
     if not workers:
         return InProcessLauncher(TaskHandler(experiment, single_thread=not timed))
     return Pool(
-        1 if timed else workers, TaskHandler, replace(experiment, choices={}, values={}, sweep={}, also=(), marks={}), rules,
-        single_thread=not timed or experiment.study.fresh_process, folders=experiment.plugins, outside=lambda task: task.outside,
-    )  # fmt: skip
+        1 if timed else workers,
+        TaskHandler,
+        replace(experiment, choices={}, values={}, sweep={}, also=(), marks={}),
+        rules,
+        single_thread=not timed or experiment.study.fresh_process,
+        folders=experiment.plugins,
+        outside=lambda task: task.outside,
+    )

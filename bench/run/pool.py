@@ -312,10 +312,14 @@ class Pool:
             ours.setsockopt(socket.SOL_SOCKET, option, struct.pack("@ll", int(EXIT_S), 0))
         output, mark = guard.temporary_file(), f"{self._reaper.mark}{uuid.uuid4().hex}"
         process = subprocess.Popen(
-            command(theirs.fileno()), pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL,
-            stdout=output, stderr=output, start_new_session=True,
+            command(theirs.fileno()),
+            pass_fds=[theirs.fileno()],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
+            start_new_session=True,
             env=registry.environment() | {MARK: mark} | dict.fromkeys(THREADS if self._single_thread else (), "1"),
-        )  # fmt: skip
+        )
         # a socket reports its end only when every copy of the other side is closed, including this copy
         theirs.close()
         worker = _Worker(process, Connection(ours.detach()), output, psutil.Process(process.pid), mark)

@@ -78,11 +78,16 @@ def bars_on(console: rich.console.Console, disable: bool = False) -> rich.progre
     name = Column(no_wrap=True, overflow="ellipsis", max_width=20)
     current = Column(no_wrap=True, overflow="ellipsis", ratio=1)
     return Progress(
-        TextColumn("{task.description}", markup=False, table_column=name), BarColumn(16),
-        TextColumn("{task.fields[counts]}", markup=False), TimeRemainingColumn(compact=True),
+        TextColumn("{task.description}", markup=False, table_column=name),
+        BarColumn(16),
+        TextColumn("{task.fields[counts]}", markup=False),
+        TimeRemainingColumn(compact=True),
         TextColumn("{task.fields[current]}", markup=False, table_column=current),
-        console=console, transient=True, expand=True, disable=disable,
-    )  # fmt: skip
+        console=console,
+        transient=True,
+        expand=True,
+        disable=disable,
+    )
 
 
 @contextmanager
@@ -107,9 +112,10 @@ def print_states(planned: Sequence[Planned], policy: str) -> None:
         this = record.kind_of_machine()
         others = (item.machine for item in planned if item.machine != this)
         _print_counts(
-            others, f"were timed on '{{}}', and this machine is '{this}': times of two kinds of machine do not compare; choose "
+            others,
+            f"were timed on '{{}}', and this machine is '{this}': times of two kinds of machine do not compare; choose "
             "another folder with name=..., or leave times out with timing=false",
-        )  # fmt: skip
+        )
     print_stale(planned)
 
 

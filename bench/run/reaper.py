@@ -44,9 +44,20 @@ class Reaper:
         self._process: subprocess.Popen[bytes] | None = None
         if MARK not in os.environ:
             self._process = subprocess.Popen(
-                [sys.executable, "-I", "-S", __file__, self.mark, "adopts" * adopts, chr(0x1F).join(sys.path)],  # without the package
-                stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
-            )  # fmt: skip
+                [
+                    sys.executable,
+                    "-I",
+                    "-S",
+                    __file__,
+                    self.mark,
+                    "adopts" * adopts,
+                    chr(0x1F).join(sys.path),
+                ],  # without the package
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,
+            )
 
     def close(self) -> None:
         """Kill the marked processes, and the descendants if this process adopts them, then the reaper's own."""

@@ -114,12 +114,19 @@ def report(name, place):
     off = float(np.max(np.abs(gradient - truth)) / (np.max(np.abs(truth)) or 1.0))
     used = resource.getrusage(resource.RUSAGE_SELF)
     facts = {
-        "bench": bench.__version__, "seconds": round(used.ru_utime + used.ru_stime, 1), "status": found.status,
-        "derivative": found.derivative, "use": found.use if found.gradient and found.setup.levels else "",
-        "cause": found.derivative_cause, "jumps": "jumps" if any(line.jumps for line in found.lines) else "no jumps", "conclusion": found.conclusion,
-        "noise": found.noise_answer, "gradient": [f"{x:.9g}" for x in gradient[:8]],
-        "truth": [f"{x:.9g}" for x in truth[:8]], "off": off if math.isfinite(off) else None,
-    }  # fmt: skip
+        "bench": bench.__version__,
+        "seconds": round(used.ru_utime + used.ru_stime, 1),
+        "status": found.status,
+        "derivative": found.derivative,
+        "use": found.use if found.gradient and found.setup.levels else "",
+        "cause": found.derivative_cause,
+        "jumps": "jumps" if any(line.jumps for line in found.lines) else "no jumps",
+        "conclusion": found.conclusion,
+        "noise": found.noise_answer,
+        "gradient": [f"{x:.9g}" for x in gradient[:8]],
+        "truth": [f"{x:.9g}" for x in truth[:8]],
+        "off": off if math.isfinite(off) else None,
+    }
     Path(place).write_text(json.dumps(facts))
 
 
@@ -148,9 +155,10 @@ def page():
     facts = sorted((about(name) for name in rows), key=lambda each: (each["package"], each["what"]))
     words = {each["name"]: agreement(each, rows[each["name"]]) for each in facts}
     intro = INTRODUCTION.format(
-        count=len({each["package"] for each in facts}), date=max(row["date"] for row in rows.values()),
+        count=len({each["package"] for each in facts}),
+        date=max(row["date"] for row in rows.values()),
         score=", ".join(f"{n} {word.removesuffix('s')}" for word, n in Counter(words.values()).most_common()),
-    )  # fmt: skip
+    )
     table = ["| package | simulator | `examine` says | truth | off | verdict | s |", "|---|---|---|---|--:|---|--:|"]
     for each in facts:
         row = rows[each["name"]]

@@ -14,9 +14,11 @@ from bench.model import Array, Problem
 GRAVITY, WALL, HEIGHT, SIGMA = 9.81, 0.06, 0.02, 0.1
 RUNS = 60
 EDGES = (
-    ("first jump", "0.69320", 0.6832, 0.7032), ("second jump", "1.19935", 1.18935, 1.20935),
-    ("first kink", "0.31467", 0.25, 0.4), ("second kink", "1.25613", 1.21, 1.4),
-)  # fmt: skip
+    ("first jump", "0.69320", 0.6832, 0.7032),
+    ("second jump", "1.19935", 1.18935, 1.20935),
+    ("first kink", "0.31467", 0.25, 0.4),
+    ("second kink", "1.25613", 1.21, 1.4),
+)
 """Angles at which the ball begins or ceases to stop at the wall, as published, each with a range around it."""
 
 

@@ -53,8 +53,10 @@ class Throw(Claim):
     def measure(self) -> Outcome:
         """Descend under three laws."""
         published = (
-            ("7.8e-5", "10.184146", "-4.160555"), ("0.00425", "-2.493337", "-4.298402"), ("7e-12", "10.638576", "-4.282096")
-        )  # fmt: skip
+            ("7.8e-5", "10.184146", "-4.160555"),
+            ("0.00425", "-2.493337", "-4.298402"),
+            ("7e-12", "10.638576", "-4.282096"),
+        )
         figures: list[Figure] = []
         series: dict[str, Any] = dict(EVERY)
         for (label, law), (loss, *ends) in zip(LAWS.items(), published, strict=True):

@@ -51,8 +51,11 @@ class SmoothedPush(Claim):
     def measure(self) -> Outcome:
         """Sample both orders at the published sharpnesses."""
         published = {
-            "1e2": ("10.82", "2970"), "1.27e4": ("10.77", "2959"), "2.8e4": ("15.99", "2967"), "6.4e4": ("3.9e5", "2368")
-        }  # fmt: skip
+            "1e2": ("10.82", "2970"),
+            "1.27e4": ("10.77", "2959"),
+            "2.8e4": ("15.99", "2967"),
+            "6.4e4": ("3.9e5", "2368"),
+        }
         figures: list[Figure] = []
         variances = []
         for beta, (first, zeroth) in published.items():

@@ -45,9 +45,13 @@ class Windows(Claim):
     def measure(self) -> Outcome:
         """Compute the optimum of each window from its gradient, which is linear in the controls."""
         published = {
-            1: ("0.0", ""), 2: ("0.090909", "0.68526"), 3: ("0.160305", "0.15146"), 4: ("0.206541", "0.04044"),
-            5: ("0.234621", "0.01129"), 6: ("0.250723", "0.00319"),
-        }  # fmt: skip
+            1: ("0.0", ""),
+            2: ("0.090909", "0.68526"),
+            3: ("0.160305", "0.15146"),
+            4: ("0.206541", "0.04044"),
+            5: ("0.234621", "0.01129"),
+            6: ("0.250723", "0.00319"),
+        }
         figures: list[Figure] = []
         gains = {}
         best = _infinite_horizon_cost(GAIN)

@@ -242,18 +242,45 @@ def _number(value: float) -> str:
 
 
 INFIX = {
-    "add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "==", "ne": "!=",
-    "and": "&", "or": "|", "xor": "^", "pow": "**",
-}  # fmt: skip
+    "add": "+",
+    "sub": "-",
+    "mul": "*",
+    "div": "/",
+    "lt": "<",
+    "le": "<=",
+    "gt": ">",
+    "ge": ">=",
+    "eq": "==",
+    "ne": "!=",
+    "and": "&",
+    "or": "|",
+    "xor": "^",
+    "pow": "**",
+}
 FORMULAS = {
-    "parameter": "parameter[{data}]", "table": "constant[{data} * horizon + t]", "noise": "noise[at({data} * noise_row + b + l)]",
+    "parameter": "parameter[{data}]",
+    "table": "constant[{data} * horizon + t]",
+    "noise": "noise[at({data} * noise_row + b + l)]",
     **{name: f"{name}[at({{data}} * {name}_row + {name}_at + l)]" for name in ("theta", "scored")},
     **{op: f"{op[:-1]}[at({op[:-1]}{{data}} + l)]" for op in LOOKUPS},
     **{op: f"{{}} {sign} {{}}" for op, sign in INFIX.items()},
-    "neg": "-{}", "not": "not {}", "select_n": "{2} if {0} else {1}", "is_finite": "abs({}) < math.inf", "stop_gradient": "{}",
-}  # fmt: skip
+    "neg": "-{}",
+    "not": "not {}",
+    "select_n": "{2} if {0} else {1}",
+    "is_finite": "abs({}) < math.inf",
+    "stop_gradient": "{}",
+}
 """The expressions of nodes by their operation, from those of their arguments."""
 CALLS = {
-    "abs": "abs", "max": "max_", "min": "min_", "sign": "sign_", "sin": "sin_", "cos": "cos_", "rsqrt": "rsqrt_",
-    "logistic": "logistic_", "floor": "np.floor", "ceil": "np.ceil", "rem": "math.fmod",
-}  # fmt: skip
+    "abs": "abs",
+    "max": "max_",
+    "min": "min_",
+    "sign": "sign_",
+    "sin": "sin_",
+    "cos": "cos_",
+    "rsqrt": "rsqrt_",
+    "logistic": "logistic_",
+    "floor": "np.floor",
+    "ceil": "np.ceil",
+    "rem": "math.fmod",
+}

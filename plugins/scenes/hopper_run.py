@@ -77,9 +77,20 @@ class HopperRun(PolicyScene, AxisContactScene, FrictionScene):
 
     def observation(self, xp: Any, q: Array, v: Array) -> Array:
         length, angle, _, (stretching, across) = self._leg(xp, q, v)
-        return xp.stack([
-            q[1], length - self.leg, q[4], q[2], angle - q[2], v[1], stretching, v[0], v[2], across / length - v[2],
-        ])  # fmt: skip
+        return xp.stack(
+            [
+                q[1],
+                length - self.leg,
+                q[4],
+                q[2],
+                angle - q[2],
+                v[1],
+                stretching,
+                v[0],
+                v[2],
+                across / length - v[2],
+            ]
+        )
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         length, angle, (x, z), (stretching, _) = self._leg(xp, q, v)
@@ -88,10 +99,15 @@ class HopperRun(PolicyScene, AxisContactScene, FrictionScene):
         # the force on the foot: push along the leg, and the hip's torque over the length across it
         across = turn / length
         force_x, force_z = push * x - across * z, push * z + across * x
-        return xp.stack([
-            -force_x / self.body_mass, -force_z / self.body_mass - self.gravity, -turn / self.inertia,
-            force_x / self.foot_mass, force_z / self.foot_mass - self.gravity,
-        ])  # fmt: skip
+        return xp.stack(
+            [
+                -force_x / self.body_mass,
+                -force_z / self.body_mass - self.gravity,
+                -turn / self.inertia,
+                force_x / self.foot_mass,
+                force_z / self.foot_mass - self.gravity,
+            ]
+        )
 
     def has_ended(self, xp: Any, q: Array, v: Array) -> Array:
         return (q[1] < self.low) | (xp.abs(q[2]) > self.tilt)

@@ -70,18 +70,43 @@ class BackwardMemory(StudyPackage):
     name = "backward_memory"
     axes = PARTS
     columns = Columns.of(
-        *bounded("memory_mb", "largest resident memory during `samples` gradients beyond the memory before, median over calls",
-                 "MiB", RANGE, label="memory", measured=True),
-        *bounded("gradient_s", "processor time of `samples` gradients on one thread, median over calls", "s", RANGE,
-                 label="gradients", measured=True, format="seconds"),
-        Column("process_mb", "resident memory before the gradients: libraries, compiled program, theta and noise", "MiB",
-               label="process", measured=True),
-        exact("gradient_error_rel", "distance of the mean gradient from that of the backend in `compared_with`, relative to its norm",
-              "difference of gradients", "difference"),
+        *bounded(
+            "memory_mb",
+            "largest resident memory during `samples` gradients beyond the memory before, median over calls",
+            "MiB",
+            RANGE,
+            label="memory",
+            measured=True,
+        ),
+        *bounded(
+            "gradient_s",
+            "processor time of `samples` gradients on one thread, median over calls",
+            "s",
+            RANGE,
+            label="gradients",
+            measured=True,
+            format="seconds",
+        ),
+        Column(
+            "process_mb",
+            "resident memory before the gradients: libraries, compiled program, theta and noise",
+            "MiB",
+            label="process",
+            measured=True,
+        ),
+        exact(
+            "gradient_error_rel",
+            "distance of the mean gradient from that of the backend in `compared_with`, relative to its norm",
+            "difference of gradients",
+            "difference",
+        ),
         text("compared_with", "backend of the gradient that gradient_error_rel compares with"),
-        numbers("gradient", "mean gradient of the batch, by coordinate of theta",
-                comparison=ComparisonRule("vector", "gradient")),
-    )  # fmt: skip
+        numbers(
+            "gradient",
+            "mean gradient of the batch, by coordinate of theta",
+            comparison=ComparisonRule("vector", "gradient"),
+        ),
+    )
     timed = fresh_process = True
 
     calls: int = param(
@@ -116,9 +141,12 @@ class BackwardMemory(StudyPackage):
             seconds.append(time.process_time() - started)
             peaks.append(timing.peak_memory_mb() - before[-1])
         result = finite_status("the gradient is not finite", gradient) | {
-            "gradient": gradient.tolist(), **spread("gradient_s", seconds), **spread("memory_mb", peaks),
-            "process_mb": float(np.median(before)), "compared_with": "",
-        }  # fmt: skip
+            "gradient": gradient.tolist(),
+            **spread("gradient_s", seconds),
+            **spread("memory_mb", peaks),
+            "process_mb": float(np.median(before)),
+            "compared_with": "",
+        }
         if cell.ranked_backends:
             other = session.problems.of(cell.ranked_backends[0], cell)
             expected = other.grad(other.program.theta0, w).mean(axis=1)
@@ -143,7 +171,15 @@ class BackwardMemory(StudyPackage):
         tried = tried.iloc[tried["key"].map(places).fillna(len(places)).to_numpy().argsort(kind="stable")]
         first, good = str(tried["method"].iloc[0]), tried[has_result]
         lines = longest(good, first)
-        table = Table("backward_memory_methods", lines, LINES, "Memory and time of a backward pass", [NOTE], terminal=True, page=True)  # fmt: skip
+        table = Table(
+            "backward_memory_methods",
+            lines,
+            LINES,
+            "Memory and time of a backward pass",
+            [NOTE],
+            terminal=True,
+            page=True,
+        )
         return Views([table, cells], _charts(shown, good))
 
 
@@ -167,9 +203,11 @@ def with_error(rows: pd.DataFrame) -> pd.DataFrame:
     low, high = (rows["memory_mb_low"] - FLOOR).clip(lower=0.0), rows["memory_mb_high"] + FLOOR
     limit = high.clip(lower=SMALL)
     return rows.assign(
-        memory_mb=memory.mask(is_small, limit), memory_mb_low=low.mask(is_small, 0.0),
-        memory_mb_high=high.mask(is_small, limit), is_small=is_small,
-    )  # fmt: skip
+        memory_mb=memory.mask(is_small, limit),
+        memory_mb_low=low.mask(is_small, 0.0),
+        memory_mb_high=high.mask(is_small, limit),
+        is_small=is_small,
+    )
 
 
 def longest(good: pd.DataFrame, first: str) -> pd.DataFrame:
@@ -212,8 +250,17 @@ def _charts(shown: Shown, good: pd.DataFrame) -> list[Chart]:
         "backward_time": shown.column("gradient_s", label="time of a batch of gradients", log=True),
     }
     return [
-        Chart(name, good, [horizon], [y], series="method", panel="problem", across=2,
-              title=f"How much {what} does the gradient of a long rollout take?", subtitle=f"Batches of {samples} rollouts on one thread, median of calls",
-              text=f"Little is known below {SMALL:.0f} MiB.")
+        Chart(
+            name,
+            good,
+            [horizon],
+            [y],
+            series="method",
+            panel="problem",
+            across=2,
+            title=f"How much {what} does the gradient of a long rollout take?",
+            subtitle=f"Batches of {samples} rollouts on one thread, median of calls",
+            text=f"Little is known below {SMALL:.0f} MiB.",
+        )
         for what, (name, y) in zip(("memory", "time"), drawn.items(), strict=True)
-    ]  # fmt: skip
+    ]

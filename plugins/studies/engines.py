@@ -35,13 +35,29 @@ SAME = 0.1
 USELESS = 1.0
 """Relative RMSE from which on an estimate is no better than the zero estimate."""
 SHOWN = (
-    "program_error_rel", "model_error_rel", "rmse_rel", "zeroth_rmse_rel", "nan_share", "value_s", "gradient_s", "first_s",
-    "pipe_share", "memory_mb",
-)  # fmt: skip
+    "program_error_rel",
+    "model_error_rel",
+    "rmse_rel",
+    "zeroth_rmse_rel",
+    "nan_share",
+    "value_s",
+    "gradient_s",
+    "first_s",
+    "pipe_share",
+    "memory_mb",
+)
 DETAILS = (
-    "difference_step", "model", "reference_norm", "reference_se", "reference_method", "bias", "bias_low", "bias_high",
-    "variance", "pass_share",
-)  # fmt: skip
+    "difference_step",
+    "model",
+    "reference_norm",
+    "reference_se",
+    "reference_method",
+    "bias",
+    "bias_low",
+    "bias_high",
+    "variance",
+    "pass_share",
+)
 """Further columns of the page."""
 LEVELS = {
     "right": Style(PALETTE[3], meaning="+: derivative of its program, and near the model's gradient"),
@@ -68,30 +84,60 @@ class Engines(StudyPackage):
     axes = PARTS
     timed = True
     columns = Columns.of(
-        exact("program_error_rel", "distance of the gradient from its best central difference, relative to that difference",
-              "program error", "program error"),
+        exact(
+            "program_error_rel",
+            "distance of the gradient from its best central difference, relative to that difference",
+            "program error",
+            "program error",
+        ),
         Column("difference_step", "step of the best central difference, in the units of theta"),
-        exact("model_error_rel", "distance of the gradient from the gradient named in `model`, relative to its norm", "model error",
-              "model error"),
+        exact(
+            "model_error_rel",
+            "distance of the gradient from the gradient named in `model`, relative to its norm",
+            "model error",
+            "model error",
+        ),
         text("model", "what model_error_rel compares with: rigid contact in closed form, or the scene's own program"),
         *(ESTIMATES.by_name[name] for name in (*SUMMARY[:2], "reference_method", "reference_spacing", *SUMMARY[2:])),
-        Column("zeroth_rmse_rel", "rmse_rel from `samples` costs with scores, without gradients", label="RMSE, costs only"),
+        Column(
+            "zeroth_rmse_rel", "rmse_rel from `samples` costs with scores, without gradients", label="RMSE, costs only"
+        ),
         Column("nan_share", "share of the gradients that are not finite", label="NaN share"),
         seconds("gradient_s", "time of `batch` gradients, median", "gradients"),
         seconds("value_s", "time of `batch` costs, median", "costs"),
         seconds("first_s", "time of the first gradients and costs, with starts and compilation", "first call"),
-        Column("pipe_share", "share of gradient_s outside the engine's process: pipes and copies", label="pipe", measured=True),
-        Column("pass_share", "share of gradient_s in this process: costs, policy and adjoint pass", label="harness",
-               measured=True),
-        Column("memory_mb", "largest resident memory of the process that runs the engine", "MB", label="memory",
-               measured=True),
+        Column(
+            "pipe_share",
+            "share of gradient_s outside the engine's process: pipes and copies",
+            label="pipe",
+            measured=True,
+        ),
+        Column(
+            "pass_share",
+            "share of gradient_s in this process: costs, policy and adjoint pass",
+            label="harness",
+            measured=True,
+        ),
+        Column(
+            "memory_mb",
+            "largest resident memory of the process that runs the engine",
+            "MB",
+            label="memory",
+            measured=True,
+        ),
         text("device", "device that computes, such as cpu or cuda:0"),
-        text("engine_settings", "settings of an engine's process that can change its last digits: processors, environment "
-             "variables, and its own, such as its determinism"),
-        numbers("gradient", "gradient at theta without noise, by coordinate of theta",
-                comparison=ComparisonRule("vector", "gradient")),
+        text(
+            "engine_settings",
+            "settings of an engine's process that can change its last digits: processors, environment "
+            "variables, and its own, such as its determinism",
+        ),
+        numbers(
+            "gradient",
+            "gradient at theta without noise, by coordinate of theta",
+            comparison=ComparisonRule("vector", "gradient"),
+        ),
         numbers("model_gradient", "the gradient that model_error_rel compares with, by coordinate of theta"),
-    )  # fmt: skip
+    )
 
     batch: int = param(64, "gradients in a timed call", positive=True)
     timed_calls: int = param(3, "timed calls", positive=True)
@@ -107,9 +153,11 @@ class Engines(StudyPackage):
         zeroth = against_reference(problem, None, truth, zeroth_order(problem, theta, w).mean(axis=1), cell.samples)
         status = {"status": "ok", "reason": "computes no gradients"}
         result |= {
-            "reference_method": truth.method, "reference_spacing": truth.spacing, "device": problem.device,
+            "reference_method": truth.method,
+            "reference_spacing": truth.spacing,
+            "device": problem.device,
             "zeroth_rmse_rel": zeroth.get("rmse_rel"),
-        }  # fmt: skip
+        }
         if has_gradient:
             _, gradient, difference, step = difference_check(problem)
             gradients = problem.grad(theta, w.reshape(-1, program.n_noise).T)
@@ -120,8 +168,9 @@ class Engines(StudyPackage):
                 "program_error_rel": relative_error(gradient, difference),
                 "difference_step": step,
                 "nan_share": float(1.0 - np.isfinite(gradients).all(axis=0).mean()),
-                **_model_error(cell, session, gradient), **{name: first.get(name) for name in SUMMARY},
-            }  # fmt: skip
+                **_model_error(cell, session, gradient),
+                **{name: first.get(name) for name in SUMMARY},
+            }
             status = finite_status("some gradients are not finite", gradients, gradient)
             status["reason"] = "; ".join(filter(None, (status["reason"], first["reason"])))
         if not truth.is_finite:
@@ -196,9 +245,12 @@ def levels(rows: pd.DataFrame) -> np.ndarray:
     # costs have two digits
     is_right = (rows["status"] == "ok") & ~(rows["nan_share"] > 0) & (rows["program_error_rel"] <= 0.02)
     kinds = {
-        "none": rows["gradient"].map(len) == 0, "wrong": ~is_right, "noisy": low >= USELESS, "open": ~(high < USELESS),
+        "none": rows["gradient"].map(len) == 0,
+        "wrong": ~is_right,
+        "noisy": low >= USELESS,
+        "open": ~(high < USELESS),
         "right": rows["model_error_rel"] <= SAME,
-    }  # fmt: skip
+    }
     return np.select(list(kinds.values()), list(kinds), "own")
 
 
@@ -227,7 +279,16 @@ def _chart(measured: pd.DataFrame) -> Chart:
     errors = (" " + measured["model_error_rel"].map(number)).mask(measured["level"] == "none", "")
     frame = measured.assign(place=measured["scene"] + rigid.map({True: ", rigid", False: ""}), cell=letters + errors)
     return Chart(
-        "engines", frame, [text("place", label="")], [text("method", label="")], "grid",
-        level="level", cell="cell", styles=LEVELS, height=0.3, across=1,
-        subtitle="number: relative distance from the model's gradient; rigid: with the law impulse", failed_name="not supported",
-    )  # fmt: skip
+        "engines",
+        frame,
+        [text("place", label="")],
+        [text("method", label="")],
+        "grid",
+        level="level",
+        cell="cell",
+        styles=LEVELS,
+        height=0.3,
+        across=1,
+        subtitle="number: relative distance from the model's gradient; rigid: with the law impulse",
+        failed_name="not supported",
+    )

@@ -83,8 +83,9 @@ class Growth(StudyPackage):
     columns = Columns.of(
         Column("time_horizon", "duration of the rollout", "s", label="horizon", format="setting"),
         *(
-            Column(f"gradient_{name}", f"norm of one sample's gradient, {q:.0%} quantile",
-                   **(MEDIAN if q == 0.5 else {}))
+            Column(
+                f"gradient_{name}", f"norm of one sample's gradient, {q:.0%} quantile", **(MEDIAN if q == 0.5 else {})
+            )
             for name, q in QUANTILES.items()
         ),
         Column("gradient_mean", "norm of the mean gradient"),
@@ -93,19 +94,30 @@ class Growth(StudyPackage):
             column
             for name, what in RATES.items()
             for column in bounded(
-                f"{name}_rate", f"log of the {what} of dx_N/dx_0, per step", stem=name, label=name,
-                comparison=ComparisonRule("interval", "growth rate", neutral=True) if name == "stretch" else None)
+                f"{name}_rate",
+                f"log of the {what} of dx_N/dx_0, per step",
+                stem=name,
+                label=name,
+                comparison=ComparisonRule("interval", "growth rate", neutral=True) if name == "stretch" else None,
+            )
         ),
         *(
             column
             for order, name in ORDERS.items()
-            for column in bounded(f"{order}_variance", f"variance of one {name} term, median over repeats",
-                                  of="the range of 5% to 95% of the repeats", label=f"variance, {name}")
+            for column in bounded(
+                f"{order}_variance",
+                f"variance of one {name} term, median over repeats",
+                of="the range of 5% to 95% of the repeats",
+                label=f"variance, {name}",
+            )
         ),
-        *(Column(f"{order}_variance_mean", f"variance of one {name} term, mean over repeats") for order, name in ORDERS.items()),
+        *(
+            Column(f"{order}_variance_mean", f"variance of one {name} term, mean over repeats")
+            for order, name in ORDERS.items()
+        ),
         text("growth", "class of the Jacobian product: exploding, neutral or vanishing", label="Jacobian product"),
         numbers("singular_values", "singular values of dx_N/dx_0, median over rollouts", label="singular values"),
-    )  # fmt: skip
+    )
 
     rollouts: int = param(
         64, "rollouts whose step Jacobians are multiplied: rates are known to 1/8 of their spread", low=2
@@ -143,10 +155,14 @@ class Growth(StudyPackage):
         singular, spectral = products(steps)
         rates = {"stretch": rate(singular[:, 0], len(steps)), "spectral": rate(spectral, len(steps))}
         return result | {
-            **{f"{name}_{end}": value for name, found in rates.items() for end, value in zip(("rate", "low", "high"), found, strict=True)},
+            **{
+                f"{name}_{end}": value
+                for name, found in rates.items()
+                for end, value in zip(("rate", "low", "high"), found, strict=True)
+            },
             "growth": classify(rates["stretch"][2], rates["spectral"][1], ROUNDING / len(steps)),
             "singular_values": np.exp(np.median(singular, axis=0)).tolist(),
-        }  # fmt: skip
+        }
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
         """Return a table with a line per problem and one with a line per cell, and the charts."""
@@ -156,15 +172,26 @@ class Growth(StudyPackage):
 
         shown = Shown(experiment, rows, along=["horizon"], method=(), problem=PARTS)
         per_second = {
-            f"{name}_{end}": shown.rows[f"{name}_{end}"] / shown.rows["dt"] for name in RATES for end in ("rate", "low", "high")
-        }  # fmt: skip
+            f"{name}_{end}": shown.rows[f"{name}_{end}"] / shown.rows["dt"]
+            for name in RATES
+            for end in ("rate", "low", "high")
+        }
         columns = [
-            COMMON["horizon"], shown.column("time_horizon"), shown.column("gradient_median"),
-            *(shown.column(f"{name}_rate", unit="1/s") for name in RATES), shown.column("growth"),
+            COMMON["horizon"],
+            shown.column("time_horizon"),
+            shown.column("gradient_median"),
+            *(shown.column(f"{name}_rate", unit="1/s") for name in RATES),
+            shown.column("growth"),
             *(shown.column(f"{order}_variance", low="", high="") for order in ORDERS),
-        ]  # fmt: skip
-        cells = shown.cells(columns, "growth of gradients with the horizon", [NOTE], ("scene", "contact"),
-                            shown.rows.assign(**per_second), terminal=False)  # fmt: skip
+        ]
+        cells = shown.cells(
+            columns,
+            "growth of gradients with the horizon",
+            [NOTE],
+            ("scene", "contact"),
+            shown.rows.assign(**per_second),
+            terminal=False,
+        )
         good = shown.rows[np.isfinite(shown.rows["gradient_median"]) & (shown.rows["gradient_median"] > 0)]
         if good.empty:
             return Views([cells])
@@ -173,10 +200,18 @@ class Growth(StudyPackage):
             "growth_verdicts", lines, VERDICT, "Growth of the gradient", [VERDICT_NOTE], terminal=True, page=True
         )
         chart = Chart(
-            "growth", good, [shown.column("time_horizon", log=True)], [shown.column("gradient_median", log=True)], panel="problem",
-            across=5, height=1.9, band=True, panel_notes=dict(zip(lines["problem"], lines["verdict"].map(MEANING), strict=True)),
-            subtitle="median over noise samples", text="On these axes a power law is straight and an exponential bends upwards.",
-        )  # fmt: skip
+            "growth",
+            good,
+            [shown.column("time_horizon", log=True)],
+            [shown.column("gradient_median", log=True)],
+            panel="problem",
+            across=5,
+            height=1.9,
+            band=True,
+            panel_notes=dict(zip(lines["problem"], lines["verdict"].map(MEANING), strict=True)),
+            subtitle="median over noise samples",
+            text="On these axes a power law is straight and an exponential bends upwards.",
+        )
         named = shown.arranged.rows.assign(problem=shown.rows["problem"]).fillna({"problem": ""})
         return Views([answers, cells], [chart], named)
 
@@ -238,8 +273,12 @@ def verdict(rows: pd.DataFrame) -> dict[str, Any]:
     # the first of the longest horizons at all of which the zeroth order varies less
     start = horizons[np.logical_and.accumulate(zeroth[::-1])[::-1]].min(initial=math.inf)
     lower = "zeroth" if math.isfinite(start) else "first" if is_first else "open"
-    return {"problem": rows["problem"].iloc[0], **fitted, "lower": lower,
-            "zeroth_from": start if lower == "zeroth" else math.nan}  # fmt: skip
+    return {
+        "problem": rows["problem"].iloc[0],
+        **fitted,
+        "lower": lower,
+        "zeroth_from": start if lower == "zeroth" else math.nan,
+    }
 
 
 def fit(horizons: np.ndarray, norms: np.ndarray, errors: np.ndarray, bounded: bool = False) -> dict[str, Any]:

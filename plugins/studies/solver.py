@@ -37,16 +37,24 @@ class Solver(StudyPackage):
         Column("iterations", "maximum iterations of the constraint solver"),
         Column("gradient_norm", "norm of the gradient"),
         Column("converged_norm", "norm of the converged program's gradient"),
-        exact("gradient_error_rel", "norm of (gradient - converged program's gradient) / converged_norm", "error of the gradient",
-              "error, relative"),
+        exact(
+            "gradient_error_rel",
+            "norm of (gradient - converged program's gradient) / converged_norm",
+            "error of the gradient",
+            "error, relative",
+        ),
         Column("gradient_cosine", "cosine between the gradient and the converged program's gradient", label="cosine"),
-        exact("wrong_signs", "share of coordinates whose sign is not that of the converged program's gradient", "wrong signs",
-              "wrong signs"),
+        exact(
+            "wrong_signs",
+            "share of coordinates whose sign is not that of the converged program's gradient",
+            "wrong signs",
+            "wrong signs",
+        ),
         seconds("gradient_s", "time of the gradients of `samples` rollouts", "gradients"),
         seconds("compile_s", "time of compiling the gradient", "compilation"),
         numbers("gradient", "gradient at w = 0, by coordinate of theta"),
         numbers("converged_gradient", "the converged program's gradient at w = 0, by coordinate of theta"),
-    )  # fmt: skip
+    )
     timed = True
 
     converged: int = param(100, "iterations of the program that counts as converged", positive=True)
@@ -68,14 +76,17 @@ class Solver(StudyPackage):
         # share of the gradient's norm up to which a coordinate of the converged gradient has no sign
         has_sign = np.abs(target) > 1e-6 * norm(target)
         return {
-            **finite_status("a gradient is not finite", gradient, target), "iterations": backend.iterations,
-            "gradient": gradient.tolist(), "converged_gradient": target.tolist(),
+            **finite_status("a gradient is not finite", gradient, target),
+            "iterations": backend.iterations,
+            "gradient": gradient.tolist(),
+            "converged_gradient": target.tolist(),
             **gradient_seconds(problem, w, self.timed_calls),
-            "gradient_norm": norm(gradient), "converged_norm": norm(target),
+            "gradient_norm": norm(gradient),
+            "converged_norm": norm(target),
             "gradient_error_rel": relative_error(gradient, target),
             "gradient_cosine": float(gradient @ target) / (norm(gradient) * norm(target)),
             "wrong_signs": float((np.sign(gradient) != np.sign(target))[has_sign].mean()),
-        }  # fmt: skip
+        }
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
         """Return the table with a line per scene, engine and iterations, and the chart of errors."""
@@ -90,7 +101,14 @@ class Solver(StudyPackage):
         error = shown.column("gradient_error_rel", label="relative error", least=1e-6, log=True)
         fewer = shown.good[shown.good["iterations"] < self.converged]  # a converged program has no error to itself
         chart = Chart(
-            "solver", fewer, [iterations], [error], series="method", panel="problem", styles=nested(fewer["method"].unique()),
-            marks=[Mark("as large as the gradient", 1.0, axis="y")], subtitle=f"against the gradient of the same program after {self.converged} iterations",
-        )  # fmt: skip
+            "solver",
+            fewer,
+            [iterations],
+            [error],
+            series="method",
+            panel="problem",
+            styles=nested(fewer["method"].unique()),
+            marks=[Mark("as large as the gradient", 1.0, axis="y")],
+            subtitle=f"against the gradient of the same program after {self.converged} iterations",
+        )
         return Views([cells], [chart])

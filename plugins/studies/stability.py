@@ -57,13 +57,22 @@ CAUSES = ("step", "law", "both", "unknown")
 LIMIT = "stability limit of the step in theory"
 GROWN = "has grown by"
 RESULTS = (
-    "verdict", "cause", "relative_error", "cosine", "spectral_radius", "stiffness_limit", "first_bad_step", "truth",
-)  # fmt: skip
+    "verdict",
+    "cause",
+    "relative_error",
+    "cosine",
+    "spectral_radius",
+    "stiffness_limit",
+    "first_bad_step",
+    "truth",
+)
 SHARES = (
-    text("scene"), text("step", label="law and integrator"), Column("cells", format="setting"),
+    text("scene"),
+    text("step", label="law and integrator"),
+    Column("cells", format="setting"),
     *(Column(name, format="percent") for name in ("right", "wrong", *OTHER)),
     *(Column(f"by {cause}", label=f"wrong by {cause}", format="percent") for cause in CAUSES),
-)  # fmt: skip
+)
 SHARE_NOTES = (
     "Right: an error below the study's limit, as a share of the cell's own gradient. Near 0: not right, but "
     "gradient and error are below that share of the scene's largest gradient: it passes through 0, where a share of it says little. Blows up: "
@@ -156,8 +165,15 @@ class Stability(StudyPackage):
             return None
         found = cells[["error_share", "level"]].reindex(rows.index)
         whole = Table("stability_map", table(experiment, rows).assign(**found), [], files=["csv"])
-        shares = Table("stability_shares", shares_of(cells), SHARES, "How often each contact law and step gives the right gradient",
-                       SHARE_NOTES, terminal=True, page=True)  # fmt: skip
+        shares = Table(
+            "stability_shares",
+            shares_of(cells),
+            SHARES,
+            "How often each contact law and step gives the right gradient",
+            SHARE_NOTES,
+            terminal=True,
+            page=True,
+        )
         columns = [experiment.columns.by_name[name] for name in RESULTS]
         return Views([shares, whole], charts(cells, self.inaccurate), arrange(experiment, rows).rows, columns)
 
@@ -402,14 +418,25 @@ def cells_of(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     error = cells["relative_error"] * cells["truth_norm"] / size
     is_lost = cells["verdict"].isin(("diverged", "nonfinite"))
     grew = cells["reason"].str.contains(GROWN) & (cells["grad_norm"] <= limits.diverged * size)
-    kinds = {"grew": is_lost & grew, "blows up": is_lost, "open": error.isna(),
-             "right": cells["relative_error"] <= limits.inaccurate, "near 0": np.maximum(error, cells["truth_norm"] / size) <= limits.inaccurate}  # fmt: skip
+    kinds = {
+        "grew": is_lost & grew,
+        "blows up": is_lost,
+        "open": error.isna(),
+        "right": cells["relative_error"] <= limits.inaccurate,
+        "near 0": np.maximum(error, cells["truth_norm"] / size) <= limits.inaccurate,
+    }
     level = np.select([*kinds.values()], [*kinds], "wrong")
     over = axes_of(shown, "dt", "stiffness")
     return cells.assign(
-        problem=problem_names(shown, PROBLEM, over, rows=cells), variant=titled(cells, [axis.column for axis in shown.axes if axis not in over]), row=cells.index, error_share=error,
-        level=level, step=titled(cells, ["contact", "integrator"]), scene_name=scene.str.split("[").str[0], dt_ms=1e3 * cells["dt"],
-    )  # fmt: skip
+        problem=problem_names(shown, PROBLEM, over, rows=cells),
+        variant=titled(cells, [axis.column for axis in shown.axes if axis not in over]),
+        row=cells.index,
+        error_share=error,
+        level=level,
+        step=titled(cells, ["contact", "integrator"]),
+        scene_name=scene.str.split("[").str[0],
+        dt_ms=1e3 * cells["dt"],
+    )
 
 
 def shares_of(cells: pd.DataFrame) -> pd.DataFrame:
@@ -443,8 +470,10 @@ def charts(cells: pd.DataFrame, limit: float) -> list[Chart]:
         frame["relative_error"].map(rounded), EDGES, "error {}".format, lambda end: f"{100 * end:g}%"
     )
     frame["grade"] = frame["level"].where(frame["level"].isin(OTHER), grades)
-    frame["cell"] = ["" if e != e else (f"<{100 * min(EDGES):g}" if e < min(EDGES) else number(100 * e) if e < 10 else ">999")
-                     for e in frame["relative_error"]]  # fmt: skip
+    frame["cell"] = [
+        "" if e != e else (f"<{100 * min(EDGES):g}" if e < min(EDGES) else number(100 * e) if e < 10 else ">999")
+        for e in frame["relative_error"]
+    ]
     found: list[Chart] = []
     for scene, part in frame.groupby("scene_name", sort=False):
         panel = "step" if part["contact"].nunique() > 1 else "integrator"
@@ -453,12 +482,23 @@ def charts(cells: pd.DataFrame, limit: float) -> list[Chart]:
             best = part.loc[right.sort_values(ascending=False, kind="stable").index].drop_duplicates("contact")
             part = part[part["step"].isin(best["step"])]
         (name,) = short_names([f"{scene}, {part['variant'].max()}"], is_whole=True).values()
-        found.append(Chart(
-            f"stability_map_{scene}" if found else "stability_map", part,
-            [Column("dt_ms", "", "ms", label="time step")], [COMMON["stiffness"]], "grid", level="grade", styles=looks | OTHER, panel=panel,
-            cell="cell", limit="stiffness_limit", limit_name=LIMIT, height=0.16,
-            subtitle=f"{name}. Number: error of the gradient, in % of the true one. Near 0: gradient and error are below {100 * limit:g}% "
-                     "of the scene's largest gradient",
-            text="The worst where backends disagree. Of several contact laws, each is drawn with the integrator that is most often right.",
-        ))  # fmt: skip
+        found.append(
+            Chart(
+                f"stability_map_{scene}" if found else "stability_map",
+                part,
+                [Column("dt_ms", "", "ms", label="time step")],
+                [COMMON["stiffness"]],
+                "grid",
+                level="grade",
+                styles=looks | OTHER,
+                panel=panel,
+                cell="cell",
+                limit="stiffness_limit",
+                limit_name=LIMIT,
+                height=0.16,
+                subtitle=f"{name}. Number: error of the gradient, in % of the true one. Near 0: gradient and error are below {100 * limit:g}% "
+                "of the scene's largest gradient",
+                text="The worst where backends disagree. Of several contact laws, each is drawn with the integrator that is most often right.",
+            )
+        )
     return found

@@ -31,9 +31,17 @@ if TYPE_CHECKING:
     from bench.report.shown import Shown
 
 SUMMARY = (
-    "reference_norm", "reference_se", "bias", "bias_low", "bias_high", "bias_rel", "variance", "rmse_rel", "cosine",
+    "reference_norm",
+    "reference_se",
+    "bias",
+    "bias_low",
+    "bias_high",
+    "bias_rel",
+    "variance",
+    "rmse_rel",
+    "cosine",
     "sign_agreement",
-)  # fmt: skip
+)
 """Columns that are statistics of the estimator."""
 STEPS = 10.0 ** -np.arange(1.0, 9.5, 0.5)
 """Step sizes of the central differences, in the units of theta."""
@@ -95,11 +103,14 @@ class ThreeErrors(StudyPackage):
         cost, gradient, difference, step = difference_check(problem)
         truth = session.references.of(cell)
         result = {
-            "cost": cost, "gradient": gradient.tolist(), "program_norm": norm(gradient),
+            "cost": cost,
+            "gradient": gradient.tolist(),
+            "program_norm": norm(gradient),
             "program_error": norm(gradient - difference),
-            "program_error_rel": relative_error(gradient, difference), "difference_step": step,
+            "program_error_rel": relative_error(gradient, difference),
+            "difference_step": step,
             **_against_physics(problem.program, cost, gradient),
-        }  # fmt: skip
+        }
         estimates = cell.estimator.estimate(problem, problem.program.theta0, all_noise(cell, problem.program))
         compared = against_reference(problem, cell.estimator, truth, estimates, cell.samples)
         status = {} if np.isfinite(gradient).all() else {"status": "nonfinite"}
@@ -113,18 +124,29 @@ class ThreeErrors(StudyPackage):
         ends = {f"bias_rel_{end}": shown.rows[f"bias_{end}"] / shown.rows["reference_norm"] for end in ("low", "high")}
         bias = shown.column("bias_rel", label="estimator error", low="bias_rel_low", high="bias_rel_high")
         cells = shown.cells(
-            [COMMON["dt"], *map(shown.column, RESULTS), bias], "program, model and estimator error", [NOTE],
-            ("scene", "contact", "estimator"), shown.rows.assign(**ends),
-        )  # fmt: skip
+            [COMMON["dt"], *map(shown.column, RESULTS), bias],
+            "program, model and estimator error",
+            [NOTE],
+            ("scene", "contact", "estimator"),
+            shown.rows.assign(**ends),
+        )
         if shown.good.empty:
             return Views([cells])
         trapped, problem = traps(shown), text("problem")
         either = Column("largest", label="at the largest step"), Column("smallest", label="at the smallest step")
         tables = [
             cells,
-            Table("three_errors_traps", trapped, [problem, text("error"), *either], title="Traps", notes=[TRAP_NOTE],
-                  files=["csv"] if len(trapped) else [], terminal=bool(len(trapped)), page=True),
-        ]  # fmt: skip
+            Table(
+                "three_errors_traps",
+                trapped,
+                [problem, text("error"), *either],
+                title="Traps",
+                notes=[TRAP_NOTE],
+                files=["csv"] if len(trapped) else [],
+                terminal=bool(len(trapped)),
+                page=True,
+            ),
+        ]
         return Views(tables, [_dumbbells(shown, trapped)])
 
 
@@ -136,9 +158,14 @@ def difference_check(problem: Problem) -> tuple[float, np.ndarray, np.ndarray, f
     theta, n_noise = problem.program.theta0, problem.program.n_noise
     gradient = problem.grad()
     samples, *_ = sampled(
-        lambda at: problem.value(at, np.zeros((n_noise, at.shape[1]))), theta, np.eye(theta.size), np.ones(theta.size),
-        gradient, float(np.finfo(np.float64).eps), STEPS,
-    )  # fmt: skip
+        lambda at: problem.value(at, np.zeros((n_noise, at.shape[1]))),
+        theta,
+        np.eye(theta.size),
+        np.ones(theta.size),
+        gradient,
+        float(np.finfo(np.float64).eps),
+        STEPS,
+    )
     differences = np.array([sample.differences for sample in samples])
     errors = np.linalg.norm(differences - gradient[:, None], axis=0)
     # without the mask, np.argmin would return the index of a NaN
@@ -161,11 +188,13 @@ def _against_physics(program: Program, cost: float, gradient: np.ndarray) -> dic
         signs, physical_signs = _signs(gradient), _signs(physical)
         has_sign = physical_signs != 0
         result |= {
-            "physical_gradient": physical.tolist(), "physical_norm": norm(physical),
-            "model_error": norm(gradient - physical), "model_error_rel": relative_error(gradient, physical),
+            "physical_gradient": physical.tolist(),
+            "physical_norm": norm(physical),
+            "model_error": norm(gradient - physical),
+            "model_error_rel": relative_error(gradient, physical),
             "model_cosine": ratio(float(gradient @ physical), norm(physical) * norm(gradient)),
             "model_signs": float((signs == physical_signs)[has_sign].mean()) if has_sign.any() else math.nan,
-        }  # fmt: skip
+        }
     return result
 
 
@@ -219,9 +248,17 @@ def _dumbbells(shown: Shown, trapped: pd.DataFrame) -> Chart:
     errors = errors.sort_values("row", kind="stable").dropna(subset=["error"])
     is_trap = errors["problem"].isin(trapped["problem"]) & (errors["series"] == PHYSICS)
     return Chart(
-        "three_errors", errors.assign(series=errors["series"].mask(is_trap, TRAP)).reset_index(drop=True),
+        "three_errors",
+        errors.assign(series=errors["series"].mask(is_trap, TRAP)).reset_index(drop=True),
         [Column("error", label="relative error", least=1e-4, log=True, above_one="larger than the gradient")],
-        [text("law", label="")], "dots", series="series", panel="panel", styles=STYLES, join=True, across=2, height=0.2,
+        [text("law", label="")],
+        "dots",
+        series="series",
+        panel="panel",
+        styles=STYLES,
+        join=True,
+        across=2,
+        height=0.2,
         subtitle="at the smallest time step" if shown.over else "",
         text="The longer the line, the better a wrong gradient passes a check against differences of its own cost.",
-    )  # fmt: skip
+    )

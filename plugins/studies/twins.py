@@ -31,9 +31,15 @@ PARTED = 1e-6
 """Relative difference of states from which on two engines have parted."""
 DIFFERENCES = ("gradient_difference_rel", "state_difference_rel", "cost_difference_rel")
 SHOWN = (
-    "state_difference", "state_difference_rel", "cost_difference_rel", "gradient_difference_rel", "gradient_cosine",
-    "value_s", "gradient_s", "compile_s",
-)  # fmt: skip
+    "state_difference",
+    "state_difference_rel",
+    "cost_difference_rel",
+    "gradient_difference_rel",
+    "gradient_cosine",
+    "value_s",
+    "gradient_s",
+    "compile_s",
+)
 NOTES = (
     "Differences between the engine's twin and the scene's own program at theta without noise. Difference of states: the "
     "largest over the rollout; relative: in units of the coordinate's largest value. Times are of one batch of `samples` "
@@ -49,14 +55,23 @@ class Twins(StudyPackage):
     timed = True
     columns = Columns.of(
         Column("state_difference", "largest difference of states over time and coordinates", label="states"),
-        exact("state_difference_rel", "largest difference of states, each coordinate in units of its largest value",
-              "difference of states", "states, relative"),
+        exact(
+            "state_difference_rel",
+            "largest difference of states, each coordinate in units of its largest value",
+            "difference of states",
+            "states, relative",
+        ),
         Column("cost", "cost of the twin"),
         Column("own_cost", "cost of the scene's own program"),
         Column("cost_difference_rel", "relative difference of the costs", label="cost, relative"),
         Column("gradient_norm", "norm of the twin's gradient"),
         Column("own_gradient_norm", "norm of the own program's gradient"),
-        exact("gradient_difference_rel", "relative difference of the gradients", "difference of gradients", "gradient, relative"),
+        exact(
+            "gradient_difference_rel",
+            "relative difference of the gradients",
+            "difference of gradients",
+            "gradient, relative",
+        ),
         Column("gradient_cosine", "cosine between the gradients", label="cosine"),
         seconds("value_s", "time of the costs of `samples` rollouts", "costs"),
         seconds("gradient_s", "time of the gradients of `samples` rollouts", "gradients"),
@@ -66,7 +81,7 @@ class Twins(StudyPackage):
         text("own_backend", "backend of the scene's own program"),
         numbers("gradient", "the twin's gradient, by coordinate of theta"),
         numbers("own_gradient", "the own program's gradient, by coordinate of theta"),
-    )  # fmt: skip
+    )
 
     timed_calls: int = param(5, "calls timed for costs and for gradients", positive=True)
 
@@ -98,15 +113,20 @@ class Twins(StudyPackage):
             "own_backend": other.name,
             "state_difference": float(differences.max()),
             "state_difference_rel": float(relative.max()),
-            "cost": cost, "own_cost": own_cost, "cost_difference_rel": abs(cost - own_cost) / abs(own_cost),
-            "gradient": gradient.tolist(), "own_gradient": own_gradient.tolist(),
-            "gradient_norm": norm(gradient), "own_gradient_norm": norm(own_gradient),
+            "cost": cost,
+            "own_cost": own_cost,
+            "cost_difference_rel": abs(cost - own_cost) / abs(own_cost),
+            "gradient": gradient.tolist(),
+            "own_gradient": own_gradient.tolist(),
+            "gradient_norm": norm(gradient),
+            "own_gradient_norm": norm(own_gradient),
             "gradient_difference_rel": relative_error(gradient, own_gradient),
             "gradient_cosine": float(gradient @ own_gradient / (norm(gradient) * norm(own_gradient))),
             "value_s": timing.timed(lambda _: twin.value(theta, w), self.timed_calls)[1].median_s,
             **gradient_seconds(twin, w, self.timed_calls),
-            "trace_s": twin.usage.trace_s, "lower_s": twin.usage.lower_s,
-        }  # fmt: skip
+            "trace_s": twin.usage.trace_s,
+            "lower_s": twin.usage.lower_s,
+        }
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
         """Return the table with a line per scene and engine, and the chart of differences, the largest first."""
@@ -117,8 +137,14 @@ class Twins(StudyPackage):
         worst = shown.good.groupby("problem")["gradient_difference_rel"].transform("max")
         frame = shown.good.loc[(-worst).sort_values(kind="stable").index]
         chart = Chart(
-            "twins", frame, [shown.column(name, least=FLOOR, log=True, label=self.columns.by_name[name].doc) for name in DIFFERENCES],
-            [text("problem", label="")], "dots", series="method", marks=[Mark("rounding up to here", 1e-6)], height=0.3,
+            "twins",
+            frame,
+            [shown.column(name, least=FLOOR, log=True, label=self.columns.by_name[name].doc) for name in DIFFERENCES],
+            [text("problem", label="")],
+            "dots",
+            series="method",
+            marks=[Mark("rounding up to here", 1e-6)],
+            height=0.3,
             text="One dot per problem and engine. Left of the dashed line a difference is accumulated rounding.",
-        )  # fmt: skip
+        )
         return Views([cells], [chart])

@@ -80,13 +80,21 @@ CASES = [
     ("c38_absolute_step:cost grad=right", RIGHT, "", ""),
     ("c39_bf16_matmul:cost grad=low horizons=1,5,15,30,60 calls=4000", WRONG, "wrong_adjoint", "a short float"),
     ("c39_bf16_matmul:cost grad=double horizons=1,5,15,30,60 calls=4000", RIGHT, "", ""),
-    ("c40_backsolve:cost grad=backsolve horizons=1,3,10,20,60 calls=4000", WRONG, "continuous_adjoint", "after 60 steps"),
+    (
+        "c40_backsolve:cost grad=backsolve horizons=1,3,10,20,60 calls=4000",
+        WRONG,
+        "continuous_adjoint",
+        "after 60 steps",
+    ),
     ("c40_backsolve:cost grad=exact horizons=1,3,10,20,60 calls=4000", RIGHT, "", ""),
-]  # fmt: skip
+]
 """Arguments of ``examine``, exit status, cause where it is known, and words of the report."""
 SCENES = [
-    ("table_edge", "jump"), ("far_stop", "missed_slope"), ("corner_catch", "jump"), ("inside_box", "nan_gradient"),
-]  # fmt: skip
+    ("table_edge", "jump"),
+    ("far_stop", "missed_slope"),
+    ("corner_catch", "jump"),
+    ("inside_box", "nan_gradient"),
+]
 
 
 LONG = ("sigma", "noise", "torch", "jax", "refined", "horizons", "c05", "c06", "c25")

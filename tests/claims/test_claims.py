@@ -20,9 +20,11 @@ BLIND = {"C2": 6, "C8": 1, "C10": 1, "C14": 2, "C16": 6, "C17": 12}
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=() if name == "L4" else pytest.mark.slow if claim.quick else pytest.mark.full)
-     for name, claim in discovery.claims().items()],
-)  # fmt: skip
+    [
+        pytest.param(name, marks=() if name == "L4" else pytest.mark.slow if claim.quick else pytest.mark.full)
+        for name, claim in discovery.claims().items()
+    ],
+)
 def test_a_claim_is_reproduced_again_with_the_stored_figures(name):
     claim = discovery.claims()[name]
     again, stored = results.measure(claim), results.read(STANDARD, claim)

@@ -70,27 +70,40 @@ def interval(name, low, middle, high):
 ERRORS = {"model_error_rel": 1e-13, "program_error_rel": 0.1}
 RATE = {"stretch_rate": 1.0, "stretch_low": 0.9, "stretch_high": 1.1}
 JUDGED = [
-    ("three_errors", ERRORS, {"model_error_rel": 5e-13}, "same", ""), ("three_errors", ERRORS, {"model_error_rel": 0.2}, "worse", ""),
-    ("three_errors", ERRORS, {"program_error_rel": 0.11}, "same", ""), ("three_errors", ERRORS, {"program_error_rel": 0.01}, "better", ""),
+    ("three_errors", ERRORS, {"model_error_rel": 5e-13}, "same", ""),
+    ("three_errors", ERRORS, {"model_error_rel": 0.2}, "worse", ""),
+    ("three_errors", ERRORS, {"program_error_rel": 0.11}, "same", ""),
+    ("three_errors", ERRORS, {"program_error_rel": 0.01}, "better", ""),
     ("growth", RATE, {name: 2 * value for name, value in RATE.items()}, "changed", "growth rate 1.00 to 2.00"),
     *(
         (study, {"verdict": was}, {"verdict": now}, outcome, f"verdict {was} to {now}")
         for study, was, now, outcome in (
-            ("gradient_check", "smooth", "wrong_adjoint", "worse"), ("gradient_check", "wrong_adjoint", "kink", "better"),
-            ("gradient_check", "smooth", "marvellous", "changed"), ("stability", "ok", "wrong_sign", "worse"),
+            ("gradient_check", "smooth", "wrong_adjoint", "worse"),
+            ("gradient_check", "wrong_adjoint", "kink", "better"),
+            ("gradient_check", "smooth", "marvellous", "changed"),
+            ("stability", "ok", "wrong_sign", "worse"),
             ("stability", "wrong_sign", "inaccurate", "better"),
         )
     ),
     *(
-        ("bias_variance", interval(name, 1.8, 2.0, 2.2), interval(name, 1.8 * factor, 2.0 * factor, 2.2 * factor) | remark, outcome, said)
+        (
+            "bias_variance",
+            interval(name, 1.8, 2.0, 2.2),
+            interval(name, 1.8 * factor, 2.0 * factor, 2.2 * factor) | remark,
+            outcome,
+            said,
+        )
         for name in ("bias", "variance")
         for factor, remark, outcome, said in (
-            (10.0, {}, "worse", name), (0.1, {}, "better", name), (10.0, {"reason": "heavy tails"}, "changed", "doubtful"),
-            (10.0, {"reason": "physics: no wind"}, "worse", name), (10.0, {"reason": "physics: no wind; heavy tails"}, "changed", "doubtful"),
+            (10.0, {}, "worse", name),
+            (0.1, {}, "better", name),
+            (10.0, {"reason": "heavy tails"}, "changed", "doubtful"),
+            (10.0, {"reason": "physics: no wind"}, "worse", name),
+            (10.0, {"reason": "physics: no wind; heavy tails"}, "changed", "doubtful"),
         )
     ),
     ("bias_variance", interval("bias", 1.8, 2.0, 2.2), interval("bias", 2.1, 2.3, 2.5), "same", ""),
-]  # fmt: skip
+]
 """Studies, columns before, columns that differ after, and how compare judges each cell."""
 
 
@@ -322,12 +335,14 @@ def test_history_draws_what_changed():
     lines = [
         (result, "some", series, "RMSE", error, 0 if math.isnan(error) else 3, moved, failed, 4)
         for series, errors, moves, failures in (
-            ("same", (1.0, 1.001, 0.999), (0, 0, 0), (0, 0, 0)), ("much", (1.0, 3.0, 1.0), (math.nan,) * 3, (0, 0, 0)),
-            ("lost", (1.0, 1.0, 1.0), (0, 0, 0), (1, 1, 2)), ("moved", (1.0, 1.0, 1.0), (0, 0.01, 0.01), (0, 0, 0)),
+            ("same", (1.0, 1.001, 0.999), (0, 0, 0), (0, 0, 0)),
+            ("much", (1.0, 3.0, 1.0), (math.nan,) * 3, (0, 0, 0)),
+            ("lost", (1.0, 1.0, 1.0), (0, 0, 0), (1, 1, 2)),
+            ("moved", (1.0, 1.0, 1.0), (0, 0.01, 0.01), (0, 0, 0)),
             ("unknown", (math.nan,) * 3, (math.nan,) * 3, (4, 4, 4)),
         )
         for result, error, moved, failed in zip("abc", errors, moves, failures, strict=True)
-    ]  # fmt: skip
+    ]
     names = ["result", "experiment", "series", "column", "error", "cells", "moved", "failed", "of"]
     made = history.views(history.History(pd.DataFrame(lines, columns=names), ["a", "b", "c"]))
     (chart,) = made.charts

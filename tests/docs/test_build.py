@@ -17,8 +17,12 @@ def test_a_stale_document_is_listed_with_its_lines_and_not_written(tmp_path, mon
     page.write_text(page.read_text().replace("# Columns", "# Rows"))
     assert build.main(["--check", "columns"]) == 1
     assert capsys.readouterr().out.splitlines() == [
-        "--- columns.md", "+++ written again", "@@ -1 +1 @@", "-# Rows", "+# Columns",
-    ]  # fmt: skip
+        "--- columns.md",
+        "+++ written again",
+        "@@ -1 +1 @@",
+        "-# Rows",
+        "+# Columns",
+    ]
     assert page.read_text().startswith("# Rows")
 
 

@@ -23,8 +23,12 @@ def pages():
 
 @pytest.mark.slow
 def test_every_page_is_once_in_the_navigation_of_five_entries(pages):
-    listed = [name for text in pages.values() for block in re.findall(r"```{toctree}\n(.*?)```", text, re.DOTALL)
-              for name in re.findall(r"^(?:.* <)?([\w/.-]+)>?$", block.replace(":hidden:", ""), re.MULTILINE)]  # fmt: skip
+    listed = [
+        name
+        for text in pages.values()
+        for block in re.findall(r"```{toctree}\n(.*?)```", text, re.DOTALL)
+        for name in re.findall(r"^(?:.* <)?([\w/.-]+)>?$", block.replace(":hidden:", ""), re.MULTILINE)
+    ]
     assert sorted(listed) == sorted(set(pages) - {"index"})
     block = pages["index"].partition("```{toctree}")[2]
     assert len(re.findall(r"^[A-Z].* <|^[a-z]+$", block, re.MULTILINE)) == len(website.SECTIONS) == 5

@@ -403,9 +403,15 @@ def test_own_arithmetic_does_not_warn_and_the_cost_still_does():
 
 @pytest.mark.parametrize(
     ("error", "low", "high", "cause"),
-    [(0.01, 0.2, 0.4, "biased"), (0.5, 0.2, 0.4, "spread"), (0.5, 0.0, 0.05, "spread"), (0.01, 0.06, 0.2, "spread"),
-     (0.01, 0.0, 0.09, ""), (0.0, 0.0, 0.0, "")],
-)  # fmt: skip
+    [
+        (0.01, 0.2, 0.4, "biased"),
+        (0.5, 0.2, 0.4, "spread"),
+        (0.5, 0.0, 0.05, "spread"),
+        (0.01, 0.06, 0.2, "spread"),
+        (0.01, 0.0, 0.09, ""),
+        (0.0, 0.0, 0.0, ""),
+    ],
+)
 def test_a_bias_interval_decides_where_grad_j_is_known(error, low, high, cause):
     norm = float(error > 0)
     assert smoothing.Smoothed(0.1, np.zeros(2), error, norm, 64, 0.0, low, high, math.nan, "", ()).cause == cause

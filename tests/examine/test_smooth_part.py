@@ -37,9 +37,12 @@ def test_an_error_of_one_number_of_many_shows_through_a_rough_cost(factor):
     theta, along = random.uniform(0.5, 1.5, (2, 30))
     factors = np.where(np.argsort(np.argsort(theta)) == 15, factor, 1.0)
     report = bench.examine(
-        lambda x: float(x @ x + 1e-6 * np.sin(1e9 * (along @ x) * (1.0 + along @ x))), theta,
-        grad=lambda x: 2.0 * factors * x, calls=20_000, progress=False,
-    )  # fmt: skip
+        lambda x: float(x @ x + 1e-6 * np.sin(1e9 * (along @ x) * (1.0 + along @ x))),
+        theta,
+        grad=lambda x: 2.0 * factors * x,
+        calls=20_000,
+        progress=False,
+    )
     assert report.derivative in (("wrong",) if factor != 1.0 else ("right", "not shown")), str(report)
 
 
@@ -51,9 +54,14 @@ def exact(x):
 
 @pytest.mark.parametrize(
     ("answer", "factor", "rtol", "settings"),
-    [("not shown", 1.0, 1e-3, {}), ("right", 1.0, 1e-3, {"refined": exact}), ("wrong", 2.0, 1e-3, {}),
-     ("wrong", 1.03, 1e-3, {"refined": exact}), ("wrong", 1.03, 1e-7, {})],
-)  # fmt: skip
+    [
+        ("not shown", 1.0, 1e-3, {}),
+        ("right", 1.0, 1e-3, {"refined": exact}),
+        ("wrong", 2.0, 1e-3, {}),
+        ("wrong", 1.03, 1e-3, {"refined": exact}),
+        ("wrong", 1.03, 1e-7, {}),
+    ],
+)
 def test_a_loose_solver_leaves_open_what_its_steps_may_explain(answer, factor, rtol, settings):
     """At SciPy's default tolerance the cost's slope over any steps is off by 2% of the solution's: no breaks show how far."""
 

@@ -11,20 +11,99 @@ from hypothesis import strategies as st
 from bench.cli import main
 from bench.run.store import Store
 
-BASE = ["scenes=[heaviside]", "estimators=[fobg]", "backends=[numpy]", "samples=4", "repeats=3", "workers=0", "reference.samples=4096",
-        "name=fuzz", "--quiet"]  # fmt: skip
+BASE = [
+    "scenes=[heaviside]",
+    "estimators=[fobg]",
+    "backends=[numpy]",
+    "samples=4",
+    "repeats=3",
+    "workers=0",
+    "reference.samples=4096",
+    "name=fuzz",
+    "--quiet",
+]
 odd = st.sampled_from(
-    ["", "null", "~", "0", "-0.0", "-1", "1e400", "nan", "inf", "1e-320", "0x10", "1_0", "true", "'1'", "[]", "{}",
-     "[1,2]", "{a: 1}", "[[1]]", "[null]", "${name}", "../../x", "/etc/passwd", "a b", "ünï", "$(id)", "<b>", "%s",
-     "!!python/object:os.system", "{_target_: os.system}", "1" * 400, "\\", "'", "=", "a=b", "#", "|", "fobg[x=1]", "heaviside[sigma=0.2]"]
-)  # fmt: skip
+    [
+        "",
+        "null",
+        "~",
+        "0",
+        "-0.0",
+        "-1",
+        "1e400",
+        "nan",
+        "inf",
+        "1e-320",
+        "0x10",
+        "1_0",
+        "true",
+        "'1'",
+        "[]",
+        "{}",
+        "[1,2]",
+        "{a: 1}",
+        "[[1]]",
+        "[null]",
+        "${name}",
+        "../../x",
+        "/etc/passwd",
+        "a b",
+        "ünï",
+        "$(id)",
+        "<b>",
+        "%s",
+        "!!python/object:os.system",
+        "{_target_: os.system}",
+        "1" * 400,
+        "\\",
+        "'",
+        "=",
+        "a=b",
+        "#",
+        "|",
+        "fobg[x=1]",
+        "heaviside[sigma=0.2]",
+    ]
+)
 value = st.one_of(odd, st.floats(1e-3, 1e3).map(repr), st.integers(-5, 40).map(str), st.text(max_size=12))
 setting = st.sampled_from(
-    ["samples", "repeats", "seed", "study", "timing", "timeout", "memory", "on_error", "versions", "retry", "marks", "name",
-     "reference", "reference.samples", "sweep", "sweep.sigma", "sweep.samples", "sweep.zip", "sweep.union", "sweep._target_", "scene",
-     "scene.heaviside.sigma", "estimator.reinforce.baseline", "hydra.launcher", "+hydra.sweeper", "defaults", "+new", "~sweep",
-     "experiment", "+experiment@x", "scenes", "estimators", "backends", "contacts"]
-)  # fmt: skip
+    [
+        "samples",
+        "repeats",
+        "seed",
+        "study",
+        "timing",
+        "timeout",
+        "memory",
+        "on_error",
+        "versions",
+        "retry",
+        "marks",
+        "name",
+        "reference",
+        "reference.samples",
+        "sweep",
+        "sweep.sigma",
+        "sweep.samples",
+        "sweep.zip",
+        "sweep.union",
+        "sweep._target_",
+        "scene",
+        "scene.heaviside.sigma",
+        "estimator.reinforce.baseline",
+        "hydra.launcher",
+        "+hydra.sweeper",
+        "defaults",
+        "+new",
+        "~sweep",
+        "experiment",
+        "+experiment@x",
+        "scenes",
+        "estimators",
+        "backends",
+        "contacts",
+    ]
+)
 word = st.one_of(st.builds("{}={}".format, setting, value), st.text(max_size=10))
 words = st.lists(word, min_size=1, max_size=4).filter(
     # nothing asks for more samples than a test can pay

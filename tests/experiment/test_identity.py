@@ -52,16 +52,41 @@ def test_texts_that_look_like_numbers_are_not_numbers(capsys):
     assert main([*words, "sweep.time_of_impact=['true']"]) == 2
 
 
-@pytest.mark.parametrize("word", ["seed=1", "samples=255", "repeats=63", "reference.samples=8192", "reference.tolerance=0.01",
-                                  "timing=false", "scene.pushing.mass=0.2", "backend.numpy.dtype=float32", "study=growth",
-                                  "study=bias_variance[timed_calls=6]", "theta=[mass]", "theta0=[" + ",".join(["0.5"] * 30) + "]"])  # fmt: skip
+@pytest.mark.parametrize(
+    "word",
+    [
+        "seed=1",
+        "samples=255",
+        "repeats=63",
+        "reference.samples=8192",
+        "reference.tolerance=0.01",
+        "timing=false",
+        "scene.pushing.mass=0.2",
+        "backend.numpy.dtype=float32",
+        "study=growth",
+        "study=bias_variance[timed_calls=6]",
+        "theta=[mass]",
+        "theta0=[" + ",".join(["0.5"] * 30) + "]",
+    ],
+)
 def test_what_decides_numbers_is_in_the_key(word):
     before = {cell.key for cell in cells()}
     assert before.isdisjoint(cell.key for cell in cells(word))
 
 
-@pytest.mark.parametrize("word", ["name=other", "results_dir=elsewhere", "workers=1", "timeout=1m", "memory=1g",
-                                  "on_error=stop", "versions=rerun", "question=why"])  # fmt: skip
+@pytest.mark.parametrize(
+    "word",
+    [
+        "name=other",
+        "results_dir=elsewhere",
+        "workers=1",
+        "timeout=1m",
+        "memory=1g",
+        "on_error=stop",
+        "versions=rerun",
+        "question=why",
+    ],
+)
 def test_what_decides_none_is_not(word):
     assert [cell.key for cell in cells()] == [cell.key for cell in cells(word)]
 
@@ -149,8 +174,10 @@ def test_cells_of_an_experiment_that_joins_have_their_own_contact_law_and_the_se
     folders = folder_with(tmp_path, main=[*OWN, "also: [other]"], other=[*OTHER, "also: [main]"])
     found = grid.cells(config.load(["experiment=main", "samples=8"], folders))
     assert [(cell.scene.name, cell.contact.name if cell.contact else "") for cell in found] == [
-        ("pushing", "penalty"), ("pushing", "impulse"), ("pendulum", ""),
-    ]  # fmt: skip
+        ("pushing", "penalty"),
+        ("pushing", "impulse"),
+        ("pendulum", ""),
+    ]
     assert {cell.samples for cell in found} == {8}
     alone = grid.cells(config.load(["experiment=other", "samples=8", "also=[]"], folders))
     assert [cell.key for cell in found[1:]] == [cell.key for cell in alone]

@@ -31,8 +31,13 @@ CELLS = {
     "mjx": ["scenes=[pushing]", "contacts=[penalty]", "backends=[mjx]", "estimators=[fobg]"],
     "adam": ["study=optimise", *PUSH, "estimators=[fobg]", "optimizers=[adam]"],
     "growth": ["study=growth", *PUSH],
-    "policy": ["scenes=['cartpole_swing[policy=linear]']", "integrators=[rk4]", "backends=[numpy]", "estimators=[fobg]"],
-}  # fmt: skip
+    "policy": [
+        "scenes=['cartpole_swing[policy=linear]']",
+        "integrators=[rk4]",
+        "backends=[numpy]",
+        "estimators=[fobg]",
+    ],
+}
 """One cell of each kind whose keys are compared."""
 PAPER = ROOT / "examples" / "cost_of_error"
 EXPERIMENTS = sorted(path for folder in (ROOT / "conf", PAPER) for path in (folder / "experiment").rglob("*.yaml"))
@@ -179,8 +184,12 @@ def test_a_simulator_counts_by_its_file_and_what_that_imports(tmp_path):
         (tmp_path / "mysim.py").write_text(
             "import physics\n\ntheta = [1.0]\n\n\ndef cost(theta):\n    return theta[0]\n"
         )
-        words = ["scenes=[callable]", f"scene.callable.cost={tmp_path}/mysim.py:cost", "backends=[callable]",
-                 "estimators=[fobg]"]  # fmt: skip
+        words = [
+            "scenes=[callable]",
+            f"scene.callable.cost={tmp_path}/mysim.py:cost",
+            "backends=[callable]",
+            "estimators=[fobg]",
+        ]
         forget()
         return grid.cells(config.load(words))[0].key
 

@@ -36,9 +36,15 @@ def without(text, axis, *names):
 
 @pytest.mark.parametrize(
     ("axis", "name"),
-    [("scene", "hold"), ("estimator", "gamma"), ("study", "timed_calls"), ("backend", "dtype"), ("theta", "at"),
-     ("reference", "samples")],
-)  # fmt: skip
+    [
+        ("scene", "hold"),
+        ("estimator", "gamma"),
+        ("study", "timed_calls"),
+        ("backend", "dtype"),
+        ("theta", "at"),
+        ("reference", "samples"),
+    ],
+)
 def test_a_missing_parameter_is_its_present_default_in_its_declared_place(text, axis, name):
     assert completed_json(json.dumps(without(text, axis, name))) == text
     assert completed_json(text) == text

@@ -35,9 +35,22 @@ DIFFERENCES = {
 }
 """The two numbers for columns that are mostly rounding: errors of the best differences of costs, and of those over every step."""
 UNCOMPARED = frozenset(
-    ("reason", "command", "device", "engine_settings", "hypotheses", "optimum_status", "contradictions",
-     "best_eps", "mode_minus", "mode_plus", "check_eps", "component_step", "difference_step")
-)  # fmt: skip
+    (
+        "reason",
+        "command",
+        "device",
+        "engine_settings",
+        "hypotheses",
+        "optimum_status",
+        "contradictions",
+        "best_eps",
+        "mode_minus",
+        "mode_plus",
+        "check_eps",
+        "component_step",
+        "difference_step",
+    )
+)
 """Columns of wording or of the machine, step sizes that rounding chooses among equally good ones, and contacts at those."""
 
 

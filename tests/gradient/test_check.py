@@ -48,7 +48,9 @@ FAULTS = {
     "noise in the gradient": ("nondeterministic", cost, noisy(gradient, 1e-7)),
     "noise in the cost": ("nondeterministic", noisy(cost, 1e-12), gradient),
     "cost that depends on its place in a batch": (
-        "nondeterministic", lambda x: cost(x) + 1e-9 * np.arange(x.shape[1]), gradient
+        "nondeterministic",
+        lambda x: cost(x) + 1e-9 * np.arange(x.shape[1]),
+        gradient,
     ),
     "kept from the first theta": ("stale_gradient", cost, lambda x: gradient(THETA)),
     "cast to int": ("staircase", lambda x: stairs(x, 1e-6), lambda x: 0.0 * x),
@@ -58,7 +60,9 @@ FAULTS = {
     "theta in single precision": ("precision", lambda x: cost(single(x)), gradient),
     "cost in single precision": ("precision", lambda x: single(cost(x)), gradient),
     "term in single precision": (
-        "precision", lambda x: cost(x) + np.exp(single(x)).sum(axis=0), lambda x: gradient(x) + np.exp(x)
+        "precision",
+        lambda x: cost(x) + np.exp(single(x)).sum(axis=0),
+        lambda x: gradient(x) + np.exp(x),
     ),
     "stopped": ("disconnected", cost, lambda x: 0.0 * x),
     "one component stopped": ("disconnected", cost, lambda x: gradient(x) * [0.0, 1.0, 1.0]),
@@ -68,10 +72,16 @@ FAULTS = {
     "sign of one component": ("wrong_factor", cost, lambda x: gradient(x) * [-1.0, 1.0, 1.0]),
     "coupling left out": ("missing_term", cost, lambda x: np.cos(x) + 0.2 * x),
     "term of one component left out": ("missing_term", cost, lambda x: gradient(x) - first(np.cos(x[0]))),
-    "large term too many in one component": ("missing_term", cost, lambda x: gradient(x) + first(8.0 * np.cos(9.0 * x[0]))),
+    "large term too many in one component": (
+        "missing_term",
+        cost,
+        lambda x: gradient(x) + first(8.0 * np.cos(9.0 * x[0])),
+    ),
     "little left out": ("missing_term", cost, lambda x: gradient(x) - 0.004 * np.cos(x) * [1.0, 0.7, 0.9]),
     "term that acts only here": (
-        "missing_term", lambda x: cost(x) - 40.0 * np.maximum(0.6 - x[0], 0.0) ** 2 * (x[1] + 3.0 * x[2]), gradient
+        "missing_term",
+        lambda x: cost(x) - 40.0 * np.maximum(0.6 - x[0], 0.0) ** 2 * (x[1] + 3.0 * x[2]),
+        gradient,
     ),
     "factor that hardly changes": ("missing_term", cost, lambda x: gradient(x) * (0.5 + 2e-3 * x[1])),
     "wrong beside theta": ("missing_term", cost, lambda x: gradient(x) + 0.3 * (x - THETA)),
@@ -82,12 +92,14 @@ FAULTS = {
     "kink": ("kink", lambda x: cost(x) + np.abs(x[0] - 0.3), lambda x: gradient(x) + first(np.sign(x[0] - 0.3))),
     "even kink": ("kink", lambda x: np.abs(x - THETA[:, None]).sum(axis=0), lambda x: np.sign(x - THETA)),
     "beyond both slopes of a kink": (
-        "wrong_adjoint", lambda x: np.abs(x[0] - 0.3) + x[1:].sum(axis=0), lambda x: np.array([1.5, 1.0, 1.0])
+        "wrong_adjoint",
+        lambda x: np.abs(x[0] - 0.3) + x[1:].sum(axis=0),
+        lambda x: np.array([1.5, 1.0, 1.0]),
     ),
     "clipped": ("saturated", lambda x: cost(clipped(x)), lambda x: gradient(clipped(x)) * [1.0, 1.0, x[2] > -0.695]),
     "cost that is not a number": ("nonfinite", lambda x: cost(x) * np.nan, gradient),
     "cost without a scale": ("unsettled", lambda x: np.modf(1e4 * np.sin(1e14 * x))[0].sum(axis=0), gradient),
-}  # fmt: skip
+}
 """Name of a fault to the cause that it must get, and the cost and gradient that have it."""
 
 

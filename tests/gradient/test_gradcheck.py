@@ -223,9 +223,20 @@ def test_components_are_columns_of_the_row(tmp_path):
 
 
 def test_worst_check_decides_the_line_of_a_point():
-    rows = pd.DataFrame([GradientCheck.columns.blank() | {
-        "point": ["start", "start"], "check_verdict": ["smooth", "wrong_adjoint"], "check_error": [1e-9, 0.5],
-        "check_eps": [1e-5, 1e-6], "key": "k", "sample": [0, 0], "direction": [0, 1], "derivative_program": [1.0, 1.0],
-    }])  # fmt: skip
+    rows = pd.DataFrame(
+        [
+            GradientCheck.columns.blank()
+            | {
+                "point": ["start", "start"],
+                "check_verdict": ["smooth", "wrong_adjoint"],
+                "check_error": [1e-9, 0.5],
+                "check_eps": [1e-5, 1e-6],
+                "key": "k",
+                "sample": [0, 0],
+                "direction": [0, 1],
+                "derivative_program": [1.0, 1.0],
+            }
+        ]
+    )
     (line,) = by_point(rows).to_dict("records")
     assert (line["verdict"], line["error"]) == ("wrong_adjoint", 0.5)

@@ -22,9 +22,14 @@ def words(tmp_path, text):
     (tmp_path / "mysim.py").write_text(text)
     grad = "gradient" if "gradient" in text else "''"
     return [
-        f"scene.callable.grad={grad}", f"scene.callable.cost={tmp_path}/mysim.py:cost", "scene.callable.sigma=0.3", "backends=[callable]",
-        "workers=0", f"results_dir={tmp_path}", "formats=[]",
-    ]  # fmt: skip
+        f"scene.callable.grad={grad}",
+        f"scene.callable.cost={tmp_path}/mysim.py:cost",
+        "scene.callable.sigma=0.3",
+        "backends=[callable]",
+        "workers=0",
+        f"results_dir={tmp_path}",
+        "formats=[]",
+    ]
 
 
 @pytest.mark.parametrize(("text", "verdict"), [(GUARDED, "nan_gradient"), (LOG, "nonfinite")])

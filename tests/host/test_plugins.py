@@ -57,9 +57,18 @@ def listing(tree):
 def rows(tree):
     """A run of a dropped, a third-party and an unavailable plugin beside a built-in one."""
     done = tree.run(
-        "scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg,half_step,third_name,absent]",
-        "estimator.half_step.factor=0.5", "samples=8", "repeats=4", "name=mine", "workers=0", "results_dir=out", "timing=false", "formats=[]",
-    )  # fmt: skip
+        "scenes=[quadratic]",
+        "backends=[numpy]",
+        "estimators=[fobg,half_step,third_name,absent]",
+        "estimator.half_step.factor=0.5",
+        "samples=8",
+        "repeats=4",
+        "name=mine",
+        "workers=0",
+        "results_dir=out",
+        "timing=false",
+        "formats=[]",
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return pd.read_parquet(tree.root / "out" / "mine" / "rows.parquet").set_index("estimator")
 

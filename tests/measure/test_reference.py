@@ -73,8 +73,16 @@ def test_listed_breakpoints_are_panel_edges():
         ([bank.wave(1.0), bank.power(1, -np.exp(-0.5) + 1e-9), bank.power(2)], 2, 0.0, 1e-9, ""),
         ([bank.power(1, 0.2), bank.bump(2.0, 1e-4, 3e4)], 2, 0.0, 10.0, "narrower than the spacing"),
     ],
-    ids=["spike", "narrow spike", "nothing but a spike", "rounding of 1e6", "pole", "effects that cancel", "ridge between points"],
-)  # fmt: skip
+    ids=[
+        "spike",
+        "narrow spike",
+        "nothing but a spike",
+        "rounding of 1e6",
+        "pole",
+        "effects that cancel",
+        "ridge between points",
+    ],
+)
 def test_quadrature_states_an_error_that_holds(pieces, dim, least, most, words):
     """No sample meets a spike; two halvings of equal panels show a fourteenth of the error at a pole.
 
@@ -140,7 +148,7 @@ def test_certificate_of_an_assumed_fact_states_what_its_check_resolves():
         (lambda u: u + 1e280 * np.maximum(u - 9.0, 0.0), 3, False, "may not exist"),
         (lambda u: 1.0 * (u > 6.0), 5, True, "not seen"),
     ],
-)  # fmt: skip
+)
 def test_mean_that_is_in_doubt_is_a_remark(cost, dim, is_finite, words):
     """exp(a u^2) has a mean below a = 1/2 only; exp(exp(u - 7)) overflows at 13.6 deviations."""
     with np.errstate(all="ignore"):
@@ -311,7 +319,7 @@ def in_single(x):
         (lambda x: np.clip((x[0] - 0.37) / 1.2e-10, 0.0, 1.0), 0.0),
     ],
     ids=["jump", "kink", "stiff", "rounding", "root", "nan", "single", "jump in single", "steep ramp"],
-)  # fmt: skip
+)
 def test_largest_jump(cost, jump):
     draw = np.random.default_rng(0)
     starts, ends = draw.standard_normal((2, 2, 8))
@@ -333,10 +341,15 @@ def test_jumps_that_no_list_holds_are_not_for_a_rule_in_the_plane():
 
 @pytest.mark.parametrize(
     ("mean", "spread", "chosen", "error"),
-    [(1.0, 0.0, "quadrature", 0.5), (1.0, 0.01, "sampling", 0.0), (1.3, 0.01, "sampling", 0.3), (1.0, 9.0, "quadrature", 0.5),
-     (3.0, 0.01, "quadrature", 2.0)],
+    [
+        (1.0, 0.0, "quadrature", 0.5),
+        (1.0, 0.01, "sampling", 0.0),
+        (1.3, 0.01, "sampling", 0.3),
+        (1.0, 9.0, "quadrature", 0.5),
+        (3.0, 0.01, "quadrature", 2.0),
+    ],
     ids=["no spread", "less spread", "off, less spread", "more spread", "disagree"],
-)  # fmt: skip
+)
 def test_samples_replace_a_coarse_rule_that_they_agree_with(monkeypatch, mean, spread, chosen, error):
     """Samples that leave less error do, never ones that all missed the event. A disagreement is the stated error."""
     batches = mean + spread * np.linspace(-1.0, 1.0, BATCHES)[:, None]

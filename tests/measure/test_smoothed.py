@@ -54,10 +54,17 @@ def compiled(scene):
 
 @pytest.mark.parametrize(
     "estimator",
-    [Fobg(), Reinforce(), MeasureValued(), RandomizedSmoothing(), RandomizedSmoothing(variant="forward"), Guided(share=1.0),
-     SphereSmoothing()],
+    [
+        Fobg(),
+        Reinforce(),
+        MeasureValued(),
+        RandomizedSmoothing(),
+        RandomizedSmoothing(variant="forward"),
+        Guided(share=1.0),
+        SphereSmoothing(),
+    ],
     ids=str,
-)  # fmt: skip
+)
 def test_estimators_average_over_the_scenes_own_noise(estimator):
     problem = compiled(Windy())
     assert (problem.dim, problem.program.n_noise) == (2, 4)
@@ -97,13 +104,19 @@ def test_rows_are_measured_against_the_smoothing_that_they_ask_for(tmp_path):
         for own in ("", ",reference=own")
     )
     experiment, of = loaded(
-        "scenes=[heaviside]", "scene.heaviside.theta=0.05", "backends=[numpy]", f"estimators=[{estimators}]",
+        "scenes=[heaviside]",
+        "scene.heaviside.theta=0.05",
+        "backends=[numpy]",
+        f"estimators=[{estimators}]",
         f"results_dir={tmp_path}",
-    )  # fmt: skip
+    )
     found = [References(experiment, Problems()).of(cell) for cell in of]
     gauss = [np.exp(-0.5 * (0.05 / s) ** 2) / (np.sqrt(2 * np.pi) * s) for s in (0.1, 0.2)]
     np.testing.assert_allclose([one.gradient[0] for one in found], [gauss[0], 1 / 0.4, gauss[0], gauss[1]], rtol=1e-9)
     assert [one.method for one in found] == [
-        "closed_form", "ball[radius=0.2],exact", "closed_form", "gaussian[radius=0.2],closed_form",
-    ]  # fmt: skip
+        "closed_form",
+        "ball[radius=0.2],exact",
+        "closed_form",
+        "gaussian[radius=0.2],closed_form",
+    ]
     assert [cell.estimator.declares_unbiased(cell.program()) for cell in of] == [False, True, False, True]

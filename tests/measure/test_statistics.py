@@ -130,9 +130,20 @@ ROUNDED = np.array([0.1, -7.0, 3.0]) * np.where(np.arange(12) % 2, 1 + 3e-16, 1 
 EDGES = {
     # first-order gradients of a step: 0 every time; of the 256 samples of an estimate a share of 3 / (64 * 256) may be off
     "step": (
-        np.zeros((64, 1)), [3.98942], 256,
-        dict(variance=0, variance_low=0, variance_high=RARE * 3.98942**2 / 256, variance_per_sample_high=RARE * 3.98942**2,
-             bias=3.98942, bias_low=3.98942 * (1 - RARE), bias_high=3.98942 * (1 + RARE), cosine=0, sign_agreement=0),
+        np.zeros((64, 1)),
+        [3.98942],
+        256,
+        dict(
+            variance=0,
+            variance_low=0,
+            variance_high=RARE * 3.98942**2 / 256,
+            variance_per_sample_high=RARE * 3.98942**2,
+            bias=3.98942,
+            bias_low=3.98942 * (1 - RARE),
+            bias_high=3.98942 * (1 + RARE),
+            cosine=0,
+            sign_agreement=0,
+        ),
         f"identical: the intervals allow for an event of the gradient's size, rarer than about {RARE:.2g} per sample",
     ),
     # the rule of three leaves 3 / (12 * 3) = 8% of the gradient
@@ -140,22 +151,34 @@ EDGES = {
     "7% off": (ROUNDED * 1.07, [0.1, -7.0, 3.0], 3, dict(bias_low=0), "identical"),
     "zero": (np.zeros((4, 2)), [0, 0], 10, dict(bias=0, bias_low=0, bias_high=0, rmse=0, variance=0), "identical"),
     "zero reference": (CENTRED, [0, 0], 1, dict(bias_rel=NAN, rmse_rel=NAN, cosine=NAN, sign_agreement=NAN), ""),
-    "one repeat": (np.array([[1.0, 2.0]]), [1, 0], 1, dict(variance=NAN, bias=NAN, bias_high=NAN, rmse=NAN), "1 repeat"),
+    "one repeat": (
+        np.array([[1.0, 2.0]]),
+        [1, 0],
+        1,
+        dict(variance=NAN, bias=NAN, bias_high=NAN, rmse=NAN),
+        "1 repeat",
+    ),
     "one that differs": (SPIKE, [1, 1], 1, dict(variance_low=0, variance_high=math.inf), "heavy tails"),
     # only the first coordinate has a sign to agree with
     "directions": (
-        np.array([[1.0, 1, 5], [-1, 0, 0], [0, 0, 0], [2, 0, 0]]), [1, 0, 0], 1,
-        dict(cosine=(1 / math.sqrt(27) - 1 + 0 + 1) / 4, sign_agreement=0.5), "only 4 repeats",
+        np.array([[1.0, 1, 5], [-1, 0, 0], [0, 0, 0], [2, 0, 0]]),
+        [1, 0, 0],
+        1,
+        dict(cosine=(1 / math.sqrt(27) - 1 + 0 + 1) / 4, sign_agreement=0.5),
+        "only 4 repeats",
     ),
     **{
         f"{bad}": (
-            np.where(np.arange(16).reshape(8, 2) == 7, bad, 1.0), [3, 4], 1,
-            {f.name: NAN for f in dataclasses.fields(Summary) if f.name != "note"} | dict(reference_norm=5, reference_se=0, finite_fraction=7 / 8),
+            np.where(np.arange(16).reshape(8, 2) == 7, bad, 1.0),
+            [3, 4],
+            1,
+            {f.name: NAN for f in dataclasses.fields(Summary) if f.name != "note"}
+            | dict(reference_norm=5, reference_se=0, finite_fraction=7 / 8),
             "1 of 8 estimates are not finite",
         )
         for bad in (math.nan, math.inf, -math.inf)
     },
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("edge", EDGES)

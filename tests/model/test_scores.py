@@ -84,10 +84,19 @@ def test_estimators_that_need_scores_are_refused_in_one_sentence(tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "gusts.py").write_text(GUSTS)
     rows = bench.run(
-        name="mine", plugins=str(tmp_path / "mine"), results_dir=str(tmp_path / "out"), scenes=["gusts"],
-        integrators=["semi_implicit_euler"], backends=["numpy"], estimators=["fobg", "reinforce", "alpha_order"],
-        samples=8, repeats=16, workers=0, timing=False, formats=[],
-    ).set_index("estimator")  # fmt: skip
+        name="mine",
+        plugins=str(tmp_path / "mine"),
+        results_dir=str(tmp_path / "out"),
+        scenes=["gusts"],
+        integrators=["semi_implicit_euler"],
+        backends=["numpy"],
+        estimators=["fobg", "reinforce", "alpha_order"],
+        samples=8,
+        repeats=16,
+        workers=0,
+        timing=False,
+        formats=[],
+    ).set_index("estimator")
     assert dict(rows["status"]) == {"fobg": "ok", "reinforce": "unsupported", "alpha_order": "unsupported"}
     for name in ("reinforce", "alpha_order"):
         assert rows.loc[name, "reason"] == f"{name} needs scores, but {REASON.format('gusts')}"

@@ -46,13 +46,16 @@ CASES = {
     "pushing at": (Pushing(sigma=SIGMA), Penalty(stiffness=1e3), ("stiffness", "mass"), (700.0, 0.2)),
     "pushing softplus": (Pushing(sigma=SIGMA), Softplus(stiffness=1e3), ("beta", "scene.velocity_factor")),
     "bouncing_ball": (
-        BouncingBall(sigma=SIGMA, horizon=100, dt=0.01), Impulse(), ("restitution", "bouncing_ball.gravity"), (0.8, 9.0),
+        BouncingBall(sigma=SIGMA, horizon=100, dt=0.01),
+        Impulse(),
+        ("restitution", "bouncing_ball.gravity"),
+        (0.8, 9.0),
     ),
     "mass_spring": (MassSpring(sigma=SIGMA), None, ("stiffness", "damping"), (50.0, 1.0)),
     "hopper": (Hopper(sigma=SIGMA, horizon=150), Penalty(stiffness=1e4), ("leg_stiffness",)),
     "cartpole": (Cartpole(sigma=SIGMA), None, ("length", "pole_mass")),
     "quadratic": (Quadratic(sigma=SIGMA), None, ("condition",)),
-}  # fmt: skip
+}
 """Scene, law, names of theta, and where."""
 BACKENDS = [
     pytest.param(one, id=one.name, marks=[pytest.mark.slow] * (one.name == "fused"))
@@ -230,16 +233,26 @@ def test_breakpoints_are_those_of_the_scenes_own_theta():
 @pytest.mark.parametrize(
     ("scene", "law", "decision", "message"),
     [
-        (Pushing(), Penalty(), Decision(("stifness",)), r"theta of scene pushing: 'stifness'; did you mean 'stiffness'\?"),
+        (
+            Pushing(),
+            Penalty(),
+            Decision(("stifness",)),
+            r"theta of scene pushing: 'stifness'; did you mean 'stiffness'\?",
+        ),
         (Pushing(), Penalty(), Decision(("penalty.mass",)), r"'penalty\.mass'; .*allowed: .*pushing\.mass"),
         (Pushing(), Penalty(), Decision(("horizon",)), r"unknown parameter in theta .* 'horizon'"),
         (Pushing(), Penalty(), Decision(("mass", "pushing.mass")), r"names a parameter twice"),
         (Pushing(), Penalty(), Decision(("mass",), (0.1, 0.2)), r"theta0 has 2 values, theta of scene pushing has 1"),
-        (BouncingBall(), Impulse(), Decision(("height",)), r"'height', which only sets the own theta of scene bouncing_ball"),
+        (
+            BouncingBall(),
+            Impulse(),
+            Decision(("height",)),
+            r"'height', which only sets the own theta of scene bouncing_ball",
+        ),
         (Pushing(), Complementarity(), Decision(("stiffness",)), r"give finite values by theta0"),
     ],
     ids=lambda value: str(value.names or value.at) if isinstance(value, Decision) else None,
-)  # fmt: skip
+)
 def test_bad_theta_says_what_is_allowed(scene, law, decision, message):
     with pytest.raises(UserError, match=message):
         compose(scene, law, SemiImplicitEuler(), decision)

@@ -74,9 +74,18 @@ def test_hybrids_share_no_pair_between_their_halves():
 
 def test_a_design_is_a_setting_of_a_run_and_a_column_of_its_rows(tmp_path):
     rows = api.run(
-        name="designs", scenes=["quadratic"], backends=["numpy"], estimators=["fobg", "randomized_smoothing"], samples=16, repeats=8,
-        mirrored=True, sweep={"draws": ["iid", "sobol"]}, results_dir=tmp_path, formats=[], workers=0,
-    )  # fmt: skip
+        name="designs",
+        scenes=["quadratic"],
+        backends=["numpy"],
+        estimators=["fobg", "randomized_smoothing"],
+        samples=16,
+        repeats=8,
+        mirrored=True,
+        sweep={"draws": ["iid", "sobol"]},
+        results_dir=tmp_path,
+        formats=[],
+        workers=0,
+    )
     good = rows[rows["status"] == "ok"]
     assert list(good["estimator"]) == ["fobg", "fobg"]
     assert list(good["draws"]) == ["iid", "sobol"]

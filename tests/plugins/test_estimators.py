@@ -100,9 +100,15 @@ def test_the_plain_gradient_takes_one_draw_of_the_scenes_own_noise_and_no_other(
 @pytest.mark.parametrize("scene", ["pushing[horizon=5]", "heaviside[theta=0.05]"])
 def test_a_row_of_the_plain_gradient_has_no_variance_and_no_remark(estimator, scene, tmp_path):
     made, (cell,) = loaded(
-        f"scenes=[{scene}]", "backends=[numpy]", f"estimators=[{estimator}]", "samples=8", "repeats=4", "timing=false",
-        "reference.samples=4096", f"results_dir={tmp_path}",
-    )  # fmt: skip
+        f"scenes=[{scene}]",
+        "backends=[numpy]",
+        f"estimators=[{estimator}]",
+        "samples=8",
+        "repeats=4",
+        "timing=false",
+        "reference.samples=4096",
+        f"results_dir={tmp_path}",
+    )
     row = made.study.measure(cell, RunSession(made))
     assert (row["variance"], row["variance_high"]) == (0.0, 0.0)
     assert row["bias_low"] <= row["bias"] <= row["bias_high"]

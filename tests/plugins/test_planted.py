@@ -24,8 +24,14 @@ CASES = [
         ({"angle": angle}, {"error": 2 * math.sin(math.radians(angle / 2)), "cosine": math.cos(math.radians(angle))})
         for angle in (30.0, 90.0, 120.0)
     ),
-    *(({"noise": noise}, {"spread": pytest.approx(noise, rel=SPREAD), "bias": pytest.approx(0, abs=4 * noise / math.sqrt(REPEATS))}) for noise in (0.3, 3.0)),
-]  # fmt: skip
+    *(
+        (
+            {"noise": noise},
+            {"spread": pytest.approx(noise, rel=SPREAD), "bias": pytest.approx(0, abs=4 * noise / math.sqrt(REPEATS))},
+        )
+        for noise in (0.3, 3.0)
+    ),
+]
 """What is planted, and what is measured: the error of a rotation alone is 2 sin(angle / 2)."""
 
 

@@ -13,16 +13,24 @@ BACKENDS = [
     ("mujoco", "wall_penalty_1d", "supports damping_mode=clipped only"),
     ("mujoco", "tossed_box", None),
     ("mujoco[dtype=float32]", "pushing penalty[damping_mode=clipped]", "double precision"),
-    ("mjx[mode=reverse,iterations=2,derivative=unrolled]", "pushing penalty[damping_mode=clipped]", "use derivative=implicit, mode="),
+    (
+        "mjx[mode=reverse,iterations=2,derivative=unrolled]",
+        "pushing penalty[damping_mode=clipped]",
+        "use derivative=implicit, mode=",
+    ),
     ("mjx[cone=elliptic]", "tossed_box", "NaN"),
     ("mjx[cone=elliptic,iterations=9,derivative=unrolled]", "tossed_box", "use derivative=implicit and"),
-    ("mjx[cone=elliptic,iterations=9]", "pushing penalty[damping_mode=clipped]", "without friction beside elliptic cones"),
+    (
+        "mjx[cone=elliptic,iterations=9]",
+        "pushing penalty[damping_mode=clipped]",
+        "without friction beside elliptic cones",
+    ),
     ("mjx[integrator=rk4]", "pendulum", "not semi_implicit_euler"),
     ("jax", "tossed_box", "tossed_box runs only in physics engines, and backend jax is not one"),
     ("checkpointed[keep=jacobians]", "quadratic", "needs time steps"),
     ("fused", "pushing complementarity", "no root finder"),
     ("fused", "pushing straight_through", "surrogate"),
-]  # fmt: skip
+]
 ESTIMATORS = [
     ("boundary", "pushing", None),
     ("boundary", "pushing impulse", "impulse may jump"),

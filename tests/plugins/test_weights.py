@@ -45,9 +45,14 @@ def test_two_halves_are_weighted_by_hand():
 
 @pytest.mark.parametrize(
     ("method", "alpha", "doubtful"),
-    [(AlphaOrder(), 0.99, True), (AlphaOrder(), 0.8, False), (AlphaOrder(ratio=3.0), 0.99, False),
-     (AlphaOrder(gamma=1.2), 0.99, True), (AlphaOrder(gamma=0.01), 0.0, False)],
-)  # fmt: skip
+    [
+        (AlphaOrder(), 0.99, True),
+        (AlphaOrder(), 0.8, False),
+        (AlphaOrder(ratio=3.0), 0.99, False),
+        (AlphaOrder(gamma=1.2), 0.99, True),
+        (AlphaOrder(gamma=0.01), 0.0, False),
+    ],
+)
 def test_rare_caps_of_alpha_order_are_a_remark(method, alpha, doubtful):
     assert bool(method.remark({"alpha": {"median": alpha}, "eps": {"median": 1.0}})) == doubtful
 

@@ -9,11 +9,16 @@ from bench.errors import UserError
 from bench.experiment import config
 from bench.report.answer import fill, value_of
 
-TABLE = pd.DataFrame({
-    "method": ["fobg", "fobg", "smooth, wide", "smooth, wide"], "at": [10.0, 1000.0, 10.0, 1000.0],
-    "error": [0.1, 0.152, 0.5, math.nan], "error_low": [0.09, 0.14, 0.4, math.nan], "error_high": [0.11, 0.16, math.inf, math.nan],
-    "verdict": ["works", "works", "open", "no result"],
-})  # fmt: skip
+TABLE = pd.DataFrame(
+    {
+        "method": ["fobg", "fobg", "smooth, wide", "smooth, wide"],
+        "at": [10.0, 1000.0, 10.0, 1000.0],
+        "error": [0.1, 0.152, 0.5, math.nan],
+        "error_low": [0.09, 0.14, 0.4, math.nan],
+        "error_high": [0.11, 0.16, math.inf, math.nan],
+        "verdict": ["works", "works", "open", "no result"],
+    }
+)
 
 
 def filled(reference):
@@ -23,13 +28,17 @@ def filled(reference):
 @pytest.mark.parametrize(
     ("reference", "text"),
     [
-        ("errors | method=fobg | error", "0.10 to 0.15"), ("errors | method=fobg, at<=100 | error", "0.10"),
-        ("errors | method=fobg | error < 1", "0.10 to 0.15"), ("errors | method=fobg | error, verdict=works | most", "0.15"),
+        ("errors | method=fobg | error", "0.10 to 0.15"),
+        ("errors | method=fobg, at<=100 | error", "0.10"),
+        ("errors | method=fobg | error < 1", "0.10 to 0.15"),
+        ("errors | method=fobg | error, verdict=works | most", "0.15"),
         ('errors | method="smooth, wide", at=1e1 | error | interval', "0.500 [0.400, no limit]"),
-        ("errors | method=fobg, at=10 | error | percent", "10%"), ("errors | verdict!=works | method | rows", "2"),
-        ("errors | | method | names", "fobg and smooth, wide"), ("errors | at>10, verdict=works | at | integer", "1,000"),
+        ("errors | method=fobg, at=10 | error | percent", "10%"),
+        ("errors | verdict!=works | method | rows", "2"),
+        ("errors | | method | names", "fobg and smooth, wide"),
+        ("errors | at>10, verdict=works | at | integer", "1,000"),
     ],
-)  # fmt: skip
+)
 def test_a_reference_gives_the_values_of_its_rows(reference, text):
     assert filled(reference) == text
 
@@ -37,11 +46,13 @@ def test_a_reference_gives_the_values_of_its_rows(reference, text):
 @pytest.mark.parametrize(
     ("reference", "error"),
     [
-        ("errors | method=fobg | error < 0.12", "error is 0.152"), ("errors | at=10 | error, verdict=works", "verdict is open"),
-        ("errors | method=gone | error", "no rows with method=gone"), ("errors | at=1000 | error", "error is not finite"),
+        ("errors | method=fobg | error < 0.12", "error is 0.152"),
+        ("errors | at=10 | error, verdict=works", "verdict is open"),
+        ("errors | method=gone | error", "no rows with method=gone"),
+        ("errors | at=1000 | error", "error is not finite"),
         ("errors | method=fobg | error | interval", "an interval belongs to one row, and 2 are selected"),
     ],
-)  # fmt: skip
+)
 def test_an_answer_that_the_rows_do_not_carry_is_an_error(reference, error):
     with pytest.raises(LookupError, match=error):
         filled(reference)

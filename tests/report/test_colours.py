@@ -81,10 +81,18 @@ def test_a_name_has_one_colour_in_all_charts_of_an_experiment():
     """A search without an estimator was orange in one chart and brown in the next, by its place."""
     names = ["cma_es", "fobg, adam", "ppo"]
     charts = [
-        Chart(str(turn), pd.DataFrame({"x": [1.0] * 3, "name": names[turn:] + names[:turn]}), [Column("x")], [Column("x")], "points",
-              series="name", title=str(turn), styles=method_styles(["fobg, adam"]))
+        Chart(
+            str(turn),
+            pd.DataFrame({"x": [1.0] * 3, "name": names[turn:] + names[:turn]}),
+            [Column("x")],
+            [Column("x")],
+            "points",
+            series="name",
+            title=str(turn),
+            styles=method_styles(["fobg, adam"]),
+        )
         for turn in range(3)
-    ]  # fmt: skip
+    ]
     figures = [figure for _, (figure,) in writer.drawings(replace(experiment(), question="Why?"), Views(charts=charts))]
     assert [figure.texts[0].get_text() for figure in figures] == ["Why?", "1", "2"], "the main chart has the question"
     found = [{line.get_label(): line.get_color() for line in figure.legends[0].get_lines()} for figure in figures]

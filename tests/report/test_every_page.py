@@ -113,9 +113,17 @@ def test_charts_have_the_contrast_of_level_aa(dark, browser, tmp_path):
     """Of every colour of the palette and of those beyond it, and with names of backends beside points."""
     estimators = [*registry.entries()["estimators"], "unknown"]
     rows = [
-        row(stiffness=k, backend=backend, estimator=e, time_s=1e-3 * (3 * place + i + 1), rmse_rel=0.1 + 0.02 * place + i)
-        for place, e in enumerate(estimators) for i, backend in enumerate(("one", "two")) for k in (1.0, 10.0)
-    ]  # fmt: skip
+        row(
+            stiffness=k,
+            backend=backend,
+            estimator=e,
+            time_s=1e-3 * (3 * place + i + 1),
+            rmse_rel=0.1 + 0.02 * place + i,
+        )
+        for place, e in enumerate(estimators)
+        for i, backend in enumerate(("one", "two"))
+        for k in (1.0, 10.0)
+    ]
     made = experiment(sweep={"stiffness": [1.0, 10.0]}, marks={"stiffness": {"limit": 5.0}})
     browser.size(1280, 4000, dark)
     browser.show(tmp_path, page(made, table(rows)))

@@ -79,10 +79,14 @@ def test_an_answer_is_shown_without_a_page_and_its_chart_is_one_click_away(folde
 @pytest.mark.parametrize(
     "content",
     [
-        "[]", "nonsense", "[" * 100_000, '{"answer": ["text"]}',
-        '{"experiment": 3, "question": [], "answer": [3], "chart": {}}', '{"chart": "../../secret"}',
+        "[]",
+        "nonsense",
+        "[" * 100_000,
+        '{"answer": ["text"]}',
+        '{"experiment": 3, "question": [], "answer": [3], "chart": {}}',
+        '{"chart": "../../secret"}',
     ],
-)  # fmt: skip
+)
 def test_answers_of_other_types_are_left_out(content, folder):
     (folder / "good" / "answer.json").write_text(content)
     text = index.write(folder).read_text()

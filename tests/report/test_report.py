@@ -308,8 +308,9 @@ ODD = {
     "exact": {"bias": 0.0, "bias_low": 0.0, "bias_high": 0.0, "variance": 0.0, "variance_low": 0.0},
     "infinite": {"bias": math.inf, "bias_high": math.inf, "variance": math.inf, "rmse": math.inf},
     "no_interval": {"bias_low": math.nan, "bias_high": math.nan, "variance_high": math.inf},
-    "no_time": {"time_s": 0.0, "rmse_rel": 0.0}, "$s_1": {"estimator": "_x$", "dt": 0.0},
-}  # fmt: skip
+    "no_time": {"time_s": 0.0, "rmse_rel": 0.0},
+    "$s_1": {"estimator": "_x$", "dt": 0.0},
+}
 """Scenes with odd columns."""
 
 
@@ -346,10 +347,14 @@ def test_every_bias_and_interval_of_the_rows_is_in_the_data_of_the_chart(tmp_pat
 
 def test_charts_in_files_are_one_column_wide_on_request_with_texts_of_7_points(made):
     """At 3.5 inches, panels beside each other and numbers in narrow cells were unreadable."""
-    frame = pd.DataFrame([
-        {"x": f"a long name {i}", "y": f"row {j}", "panel": p, "level": "good", "cell": "1234.5"}
-        for p in "ab" for i in range(9) for j in range(2)
-    ])  # fmt: skip
+    frame = pd.DataFrame(
+        [
+            {"x": f"a long name {i}", "y": f"row {j}", "panel": p, "level": "good", "cell": "1234.5"}
+            for p in "ab"
+            for i in range(9)
+            for j in range(2)
+        ]
+    )
     grid = Chart(
         "grid", frame, [text("x", label="")], [text("y", label="")], "grid", panel="panel", level="level", cell="cell"
     )

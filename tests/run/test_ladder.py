@@ -43,9 +43,15 @@ class Forgetful(NumpyProblem):
 '''
 SCENES = ["double_integrator", "pendulum", "cartpole", "mass_spring"]
 WORDS = [
-    "name=climb", "study=gradient_check", f"scenes=[{','.join(SCENES)}]", "estimators=[fobg]",
-    "sweep.horizon=[3]", "ladder=true", "workers=0", "formats=[]",
-]  # fmt: skip
+    "name=climb",
+    "study=gradient_check",
+    f"scenes=[{','.join(SCENES)}]",
+    "estimators=[fobg]",
+    "sweep.horizon=[3]",
+    "ladder=true",
+    "workers=0",
+    "formats=[]",
+]
 
 
 def backend(name, scene):
@@ -103,8 +109,10 @@ def test_a_rung_that_its_backend_cannot_run_stops_the_climb(tmp_path):
     assert main(words) == 0
     experiment = config.load(words)
     assert statuses(experiment, "numpy") == {
-        "pendulum": "ok", "quadruped": "unsupported", "double_integrator": "waiting",
-    }  # fmt: skip
+        "pendulum": "ok",
+        "quadruped": "unsupported",
+        "double_integrator": "waiting",
+    }
     table = views_of(experiment, store_of(experiment).load()).tables[0].frame
     assert table["verdict"].tolist() == ["passed", "failed", "not started"]
     assert "no cell could be checked" in table["reason"].iloc[1]

@@ -59,8 +59,13 @@ def test_a_study_that_came_and_went_meanwhile_is_seen(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "old", [{"sequence": 1.0, "stored_at": 4e9}, {}, *({"sequence": n, "stored_at": 4e9} for n in (math.inf, 1e300, -5.0, math.nan))]
-)  # fmt: skip
+    "old",
+    [
+        {"sequence": 1.0, "stored_at": 4e9},
+        {},
+        *({"sequence": n, "stored_at": 4e9} for n in (math.inf, 1e300, -5.0, math.nan)),
+    ],
+)
 def test_the_row_that_is_stored_last_wins_wherever_it_lies_and_however_the_others_are_dated(tmp_path, old):
     (tmp_path / "pending").mkdir()
     undated = {name: value for name, value in row(bias=1.0).items() if name not in ("stored_at", "sequence")}

@@ -9,9 +9,10 @@ from trees import ROOT
 
 FOLDERS = ["fused", "trainers", "policies", "claims", "engines"]
 STUDIES = [
-    path.stem for path in (ROOT / "plugins" / "studies").iterdir()
+    path.stem
+    for path in (ROOT / "plugins" / "studies").iterdir()
     if path.stem not in ("__init__", "__pycache__", "bias_variance", "gradient_check")
-]  # fmt: skip
+]
 SCRIPT = """
 from bench.cli import main
 small = ["workers=0", "formats=[]", "results_dir=results"]

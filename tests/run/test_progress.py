@@ -13,15 +13,27 @@ from bench.run import launchers, progress
 from bench.run.execute import execute
 
 PUSHING = [
-    "scenes=[pushing]", "scene.pushing.horizon=2", "backends=[numpy]", "estimators=[reinforce]", "samples=8", "repeats=4",
-    "workers=0", "timing=false", "reference.samples=256", "reference.tolerance=9",
-]  # fmt: skip
+    "scenes=[pushing]",
+    "scene.pushing.horizon=2",
+    "backends=[numpy]",
+    "estimators=[reinforce]",
+    "samples=8",
+    "repeats=4",
+    "workers=0",
+    "timing=false",
+    "reference.samples=256",
+    "reference.tolerance=9",
+]
 LONG = "pushing, penalty[stiffness=1e4], jax, alpha_order[delta=0.95,gamma=4,sharing=shared]"
 
 
 def planned(n_stored, n_due, n_refused=0):
     one = SimpleNamespace
-    return [one(stored=True, runs=False)] * n_stored + [one(stored=False, runs=True)] * n_due + [one(stored=False, runs=False)] * n_refused  # fmt: skip
+    return (
+        [one(stored=True, runs=False)] * n_stored
+        + [one(stored=False, runs=True)] * n_due
+        + [one(stored=False, runs=False)] * n_refused
+    )
 
 
 @pytest.mark.parametrize("width", [40, 80, 200])

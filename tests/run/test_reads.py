@@ -67,9 +67,15 @@ class Read(FunctionScene):
         return mass * x[0] ** 2
 '''
 SOURCES = {
-    "mine/model.json": '{{"mass": {}}}', "mine/mass.txt": "{}", "mine/mass.npy": "array", "mine/hidden/of_mass.py": "MASS = {}\n",
-    "path/of_time.py": "MASS = {}\n", "path/mass_package/__init__.py": "MASS = {}\n", "mine/model.xml": "<mass {}/>", "$TEST_MASS": "{}",
-}  # fmt: skip
+    "mine/model.json": '{{"mass": {}}}',
+    "mine/mass.txt": "{}",
+    "mine/mass.npy": "array",
+    "mine/hidden/of_mass.py": "MASS = {}\n",
+    "path/of_time.py": "MASS = {}\n",
+    "path/mass_package/__init__.py": "MASS = {}\n",
+    "mine/model.xml": "<mass {}/>",
+    "$TEST_MASS": "{}",
+}
 """What the scene reads, and the content for a mass: at its import and later, by path, by name, and by ``files``."""
 WORDS = ["scenes=[read]", "backends=[numpy]", "estimators=[fobg]", "samples=16", "repeats=4", "timing=false"]
 

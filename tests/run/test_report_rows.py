@@ -22,9 +22,13 @@ def stored(tmp_path_factory):
         (["samples=8"], [8], "bench: 1 stored rows of other settings are not shown"),
         (["sweep.samples=[4,8]"], [4, 8], ""),
         (["samples=5"], [4, 8], "none of the 1 requested cells is stored; the 2 rows shown have other settings"),
-        (["sweep.samples=[8,16]"], [8], "1 of 2 requested cells have no row; 1 stored rows of other settings are not shown"),
+        (
+            ["sweep.samples=[8,16]"],
+            [8],
+            "1 of 2 requested cells have no row; 1 stored rows of other settings are not shown",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_report_shows_the_requested_rows(stored, capsys, words, samples, said):
     assert main(["report", *WORDS, *words, f"results_dir={stored}"]) == 0
     assert said in capsys.readouterr().err

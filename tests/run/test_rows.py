@@ -21,22 +21,35 @@ from bench.run.store import Store
 
 DEEP = 1000
 PARTS = {
-    "not_json": "{nope", "list": "[1,2]", "deep_list": "[" * DEEP + "]" * DEEP,
-    "deep": '{"a":' * DEEP + "1" + "}" * DEEP, "number": "7", "null": "null", "part": '{"scene":[1]}',
-    "no_name": '{"scene":{"sigma":1}}', "odd_name": '{"scene":{"name":[1]}}', "nan": '{"scene":{"name":"a","x":NaN}}',
-    "object": '{"scene":{"name":"a","x":{"b":[1]}}}', "theta": '{"theta":{"names":3,"at":"x"}}',
-}  # fmt: skip
+    "not_json": "{nope",
+    "list": "[1,2]",
+    "deep_list": "[" * DEEP + "]" * DEEP,
+    "deep": '{"a":' * DEEP + "1" + "}" * DEEP,
+    "number": "7",
+    "null": "null",
+    "part": '{"scene":[1]}',
+    "no_name": '{"scene":{"sigma":1}}',
+    "odd_name": '{"scene":{"name":[1]}}',
+    "nan": '{"scene":{"name":"a","x":NaN}}',
+    "object": '{"scene":{"name":"a","x":{"b":[1]}}}',
+    "theta": '{"theta":{"names":3,"at":"x"}}',
+}
 SPOILT = {
     **{f"parameters_{name}": ("parameters", text, "is not an object of plugins") for name, text in PARTS.items()},
     "status": ("status", "fine", "is not one of ok, nonfinite"),
-    "variance": ("variance", -1.0, "is negative"), "rmse": ("rmse", -1.0, "is negative"),
-    "seed_missing": ("seed", math.nan, "seed is missing"), "seed_negative": ("seed", -1.0, "is not a whole number"),
+    "variance": ("variance", -1.0, "is negative"),
+    "rmse": ("rmse", -1.0, "is negative"),
+    "seed_missing": ("seed", math.nan, "seed is missing"),
+    "seed_negative": ("seed", -1.0, "is not a whole number"),
     "seed_fraction": ("seed", 0.5, "is not a whole number"),
     "samples": ("samples", 0.0, "is not a whole number of at least 1"),
-    "bytes": ("scene", b"\xff", "is not a string"), "number": ("scene", 3, "is not a string"), "word": ("bias", "large", "is not a number"),
+    "bytes": ("scene", b"\xff", "is not a string"),
+    "number": ("scene", 3, "is not a string"),
+    "word": ("bias", "large", "is not a number"),
     "long": ("reason", "x" * 2_000_000, "is not a string"),
-    "strings": ("mean_estimate", ["a"], "is not a list of numbers"), "nested": ("mean_estimate", [[1.0]], "is not a list"),
-}  # fmt: skip
+    "strings": ("mean_estimate", ["a"], "is not a list of numbers"),
+    "nested": ("mean_estimate", [[1.0]], "is not a list"),
+}
 
 
 @pytest.mark.parametrize("name", SPOILT)
@@ -85,11 +98,16 @@ def test_a_table_without_rows_is_empty(tmp_path):
 
 UNREADABLE = {
     "rows": (pa.table({"key": ["a"] * 20}), "MAX_ROWS", 10, "20 rows and .* bytes are more than a run writes"),
-    "bytes": (pa.table({f"column{i}": np.zeros(100_000) for i in range(40)}), "ALWAYS_BYTES", 1 << 20, "more than a run writes"),
+    "bytes": (
+        pa.table({f"column{i}": np.zeros(100_000) for i in range(40)}),
+        "ALWAYS_BYTES",
+        1 << 20,
+        "more than a run writes",
+    ),
     "names": (pa.Table.from_arrays([pa.array([1.0])] * 2, ["bias", "bias"]), "MAX_ROWS", 10, "bias"),
     "keys": (pa.table({"bias": [1.0]}), "MAX_ROWS", 10, "has no keys"),
     "no name": (pa.table({"key": ["a"], "": ["x"]}), "MAX_ROWS", 10, "a column has no name"),
-}  # fmt: skip
+}
 """Tables that no run writes: too many rows, too many equal values in a small file, two columns of one name, no keys."""
 
 
@@ -107,12 +125,22 @@ def test_a_table_that_no_run_writes_is_refused_and_never_overwritten(tmp_path, m
 
 
 RECORDS = {
-    "list": [], "counts": {"counts": "x"}, "counts_list": {"counts": [1]}, "counts_text": {"counts": {"ok": "x"}},
-    "config": {"config": [1]}, "sweep": {"config": {"sweep": [1]}}, "zip": {"config": {"sweep": {"zip": 3}}},
-    "question": {"question": ["a"]}, "finished": {"finished": 5}, "experiment": {"experiment": {"a": 1}},
-    "machine": {"machine": "x"}, "versions": {"versions": 3}, "load": {"machine": {"load_average": ["x", None]}},
-    "load_text": {"machine": {"load_average": 1}}, "surrogate": {"machine": {"processor": "\ud800"}, "question": "\ud800"},
-}  # fmt: skip
+    "list": [],
+    "counts": {"counts": "x"},
+    "counts_list": {"counts": [1]},
+    "counts_text": {"counts": {"ok": "x"}},
+    "config": {"config": [1]},
+    "sweep": {"config": {"sweep": [1]}},
+    "zip": {"config": {"sweep": {"zip": 3}}},
+    "question": {"question": ["a"]},
+    "finished": {"finished": 5},
+    "experiment": {"experiment": {"a": 1}},
+    "machine": {"machine": "x"},
+    "versions": {"versions": 3},
+    "load": {"machine": {"load_average": ["x", None]}},
+    "load_text": {"machine": {"load_average": 1}},
+    "surrogate": {"machine": {"processor": "\ud800"}, "question": "\ud800"},
+}
 
 
 @pytest.mark.parametrize("name", RECORDS)

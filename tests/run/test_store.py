@@ -313,10 +313,19 @@ def table(directory):
 def test_any_number_of_workers_gives_the_same_bytes(tmp_path):
     """References by quadrature and sampling too, on two backends, one of them compiling."""
     words = [
-        "scenes=[bouncing_ball,pushing]", "contacts=[penalty]", "backends=[jax,numpy]", "estimators=[fobg,reinforce]",
-        "scene.pushing.horizon=5", "scene.bouncing_ball.horizon=5", "samples=16", "repeats=4", "reference.samples=4096",
-        "timing=false", "name=sweep", "--quiet",
-    ]  # fmt: skip
+        "scenes=[bouncing_ball,pushing]",
+        "contacts=[penalty]",
+        "backends=[jax,numpy]",
+        "estimators=[fobg,reinforce]",
+        "scene.pushing.horizon=5",
+        "scene.bouncing_ball.horizon=5",
+        "samples=16",
+        "repeats=4",
+        "reference.samples=4096",
+        "timing=false",
+        "name=sweep",
+        "--quiet",
+    ]
     for workers in (0, 2):
         assert main([*words, f"workers={workers}", f"results_dir={tmp_path / str(workers)}"]) == 0
     csv = [(tmp_path / str(workers) / "sweep" / "bias_variance.csv").read_bytes() for workers in (0, 2)]

@@ -154,9 +154,16 @@ def test_a_compile_time_stands_in_the_row_of_the_cell_that_compiled(monkeypatch)
     """It stood in every row: the sum of a run of 152 s was 1,038 s."""
     monkeypatch.setattr(JaxProblem, "grain", 8)  # the reference has another width
     given, cells = loaded(
-        "scenes=[pushing]", "scene.pushing.horizon=7", "estimators=[fobg]", "sweep.stiffness=[100,1000]", "samples=8",
-        "repeats=4", "reference.samples=512", "reference.tolerance=1", "compile_cache=null",
-    )  # fmt: skip
+        "scenes=[pushing]",
+        "scene.pushing.horizon=7",
+        "estimators=[fobg]",
+        "sweep.stiffness=[100,1000]",
+        "samples=8",
+        "repeats=4",
+        "reference.samples=512",
+        "reference.tolerance=1",
+        "compile_cache=null",
+    )
     session = RunSession(given)
     first, second = (measure_cell(cell, session, cell.study) for cell in cells)
     assert first["compile_s"] > 0
@@ -166,10 +173,19 @@ def test_a_compile_time_stands_in_the_row_of_the_cell_that_compiled(monkeypatch)
 @pytest.mark.slow
 def test_run_counts_compilations_and_keeps_compiled_programs(tmp_path):
     words = [
-        "scenes=[pushing]", "contacts=[softplus]", "estimators=[fobg]", "sweep.stiffness=[100,1000]",
-        "sweep.sigma=[0.1,0.2]", "sweep.beta=[5,20]", "scene.pushing.horizon=7", "samples=8", "repeats=4",
-        "reference.samples=4096", "reference.tolerance=1", f"compile_cache={tmp_path}/kept",
-    ]  # fmt: skip
+        "scenes=[pushing]",
+        "contacts=[softplus]",
+        "estimators=[fobg]",
+        "sweep.stiffness=[100,1000]",
+        "sweep.sigma=[0.1,0.2]",
+        "sweep.beta=[5,20]",
+        "scene.pushing.horizon=7",
+        "samples=8",
+        "repeats=4",
+        "reference.samples=4096",
+        "reference.tolerance=1",
+        f"compile_cache={tmp_path}/kept",
+    ]
     assert cli.main([*words, f"results_dir={tmp_path}"]) == 0
     record = json.loads((tmp_path / "custom" / "run.json").read_text())
     assert record["compilations"] == record["distinct_shapes"] > 0

@@ -51,9 +51,14 @@ def test_a_planted_array_is_the_peak_of_each_call_in_a_process_per_cell(tmp_path
     (tmp_path / "backends").mkdir()
     (tmp_path / "backends" / "greedy.py").write_text(PLUGIN)
     rows = bench.run(
-        study="backward_memory", scenes=["mass_spring"], backends=["greedy"], sweep={"horizon": [2, 3]}, samples=4,
-        plugins=tmp_path, results_dir=tmp_path,
-    )  # fmt: skip
+        study="backward_memory",
+        scenes=["mass_spring"],
+        backends=["greedy"],
+        sweep={"horizon": [2, 3]},
+        samples=4,
+        plugins=tmp_path,
+        results_dir=tmp_path,
+    )
     for end in ("", "_low", "_high"):
         assert list(rows[f"memory_mb{end}"]) == pytest.approx([PLANTED_MB] * 2, rel=CLOSE)
     assert rows["process_mb"].min() > 20, "an interpreter with NumPy"

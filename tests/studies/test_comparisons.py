@@ -33,9 +33,15 @@ def cell(error, low, high, **values):
     norm = 4.0
     made = row(**values)
     return made | {
-        "bias": 0.0, "bias_low": 0.0, "bias_high": 0.0, "rmse_rel": error, "rmse": norm * error, "variance": (norm * error) ** 2,
-        "variance_low": (norm * low) ** 2, "variance_high": (norm * high) ** 2,
-    }  # fmt: skip
+        "bias": 0.0,
+        "bias_low": 0.0,
+        "bias_high": 0.0,
+        "rmse_rel": error,
+        "rmse": norm * error,
+        "variance": (norm * error) ** 2,
+        "variance_low": (norm * low) ** 2,
+        "variance_high": (norm * high) ** 2,
+    }
 
 
 def made(*cells, **given):
@@ -51,11 +57,17 @@ def made(*cells, **given):
 @pytest.mark.parametrize(
     ("status", "error", "low", "high", "expected"),
     [
-        ("ok", 0.5, 0.4, 0.6, WORKS), ("ok", 1.3, 0.65, 2.4, OPEN), ("ok", 2.0, 1.5, 3.0, FAILS),
-        ("ok", math.nan, math.nan, math.nan, OPEN), ("ok", 2.0, 1.5, math.inf, FAILS),
-        ("ok", 0.5, 0.1, math.inf, OPEN), ("ok", 0.5, math.nan, 0.6, OPEN), ("ok", 2.0, 1.5, math.nan, OPEN), ("nonfinite", math.nan, math.nan, math.nan, NO_RESULT),
+        ("ok", 0.5, 0.4, 0.6, WORKS),
+        ("ok", 1.3, 0.65, 2.4, OPEN),
+        ("ok", 2.0, 1.5, 3.0, FAILS),
+        ("ok", math.nan, math.nan, math.nan, OPEN),
+        ("ok", 2.0, 1.5, math.inf, FAILS),
+        ("ok", 0.5, 0.1, math.inf, OPEN),
+        ("ok", 0.5, math.nan, 0.6, OPEN),
+        ("ok", 2.0, 1.5, math.nan, OPEN),
+        ("nonfinite", math.nan, math.nan, math.nan, NO_RESULT),
     ],
-)  # fmt: skip
+)
 def test_a_verdict_needs_the_whole_interval(status, error, low, high, expected):
     assert verdict(status, error, low, high) == expected
 
@@ -90,9 +102,12 @@ def test_the_lowest_interval_is_apart_from_those_of_other_estimators(high, found
 
 def test_methods_are_tied_unless_the_interval_of_their_factor_is_above_1():
     _, compared = made(
-        *(cell(e, 0.9 * e, 1.1 * e, stiffness=k, estimator=n, gradients=0) for k in (1e2, 1e4)
-          for n, e in (("fobg", 0.10), ("reinforce", 0.105), ("finite_difference", 0.4)))
-    )  # fmt: skip
+        *(
+            cell(e, 0.9 * e, 1.1 * e, stiffness=k, estimator=n, gradients=0)
+            for k in (1e2, 1e4)
+            for n, e in (("fobg", 0.10), ("reinforce", 0.105), ("finite_difference", 0.4))
+        )
+    )
     assert list(compared["first"]) == ["fobg", "fobg"]
     assert list(compared["tied"]) == [("reinforce",)] * 2
     assert (compared["factor_low"] < 1).all()
@@ -122,11 +137,16 @@ def by_samples(estimator, rollouts, gradients=0.0, scale=1.0):
     """Cells whose error is ``scale`` over the root of N, with some rollouts and gradients per sample."""
     return [
         cell(
-            e := scale / math.sqrt(n), 0.99 * e, 1.01 * e, estimator=estimator, samples=n, rollouts=rollouts * n + 0.01,
+            e := scale / math.sqrt(n),
+            0.99 * e,
+            1.01 * e,
+            estimator=estimator,
+            samples=n,
+            rollouts=rollouts * n + 0.01,
             gradients=gradients * n,
         )
         for n in (64, 128)
-    ]  # fmt: skip
+    ]
 
 
 def test_costs_of_several_rollouts_per_sample_are_compared_at_equal_rollouts():
@@ -152,9 +172,11 @@ def test_at_one_number_of_samples_variances_are_rescaled_and_biases_stay(bias):
     """Both have the same error at 100 samples, which are 100 and 200 rollouts."""
     given = {"bias": 4 * bias, "bias_low": 3.9 * bias, "bias_high": 4.1 * bias}
     _, compared = made(
-        *(cell(0.3, 0.29, 0.31, stiffness=1e2, estimator=name, rollouts=n, gradients=0) | given
-          for name, n in (("fobg", 100), ("randomized_smoothing", 200)))
-    )  # fmt: skip
+        *(
+            cell(0.3, 0.29, 0.31, stiffness=1e2, estimator=name, rollouts=n, gradients=0) | given
+            for name, n in (("fobg", 100), ("randomized_smoothing", 200))
+        )
+    )
     assert compared[["first", "rollouts"]].values.tolist() == [["fobg", 100]]
     assert compared["factor"].item() == pytest.approx(RESCALED[bias])
 
@@ -222,9 +244,11 @@ def test_a_far_larger_error_does_not_share_the_first_place_of_an_error_that_is_n
     wide = exact | {"rmse_rel": 0.17, "bias": 0.17, "bias_low": 0.1, "bias_high": 1.7}
     good = exact | {"rmse_rel": 0.14, "bias": 0.14, "bias_low": 0.13, "bias_high": 0.15}
     _, compared = made(
-        row(stiffness=1.0, estimator="fobg", **good), row(stiffness=1.0, estimator="smooth", **wide),
-        row(stiffness=2.0, estimator="fobg", **biased), row(stiffness=2.0, estimator="smooth", **wide),
-    )  # fmt: skip
+        row(stiffness=1.0, estimator="fobg", **good),
+        row(stiffness=1.0, estimator="smooth", **wide),
+        row(stiffness=2.0, estimator="fobg", **biased),
+        row(stiffness=2.0, estimator="smooth", **wide),
+    )
     assert list(compared["leaders"]) == [("fobg", "smooth"), ("smooth",)]
 
 
@@ -305,8 +329,19 @@ def test_of_backends_that_differ_only_those_are_recommended_whose_error_is_small
 
 def test_an_estimate_that_is_always_0_fails():
     """The gradient of a step's program: its error is 1 by definition, however uncertain the reference is."""
-    zero = {"grad_norm": 0.0, "variance": 0.0, "variance_low": 0.0, "variance_high": 1e-4, "reference_norm": 1.0, "reference_se": 1e-4,
-            "bias": 1.0, "bias_low": 0.9999, "bias_high": 1.0001, "rmse_rel": 1.0, "rmse": 1.0}  # fmt: skip
+    zero = {
+        "grad_norm": 0.0,
+        "variance": 0.0,
+        "variance_low": 0.0,
+        "variance_high": 1e-4,
+        "reference_norm": 1.0,
+        "reference_se": 1e-4,
+        "bias": 1.0,
+        "bias_low": 0.9999,
+        "bias_high": 1.0001,
+        "rmse_rel": 1.0,
+        "rmse": 1.0,
+    }
     methods, _ = made(row(stiffness=1e2, **zero), row(stiffness=1e4, **zero | {"grad_norm": 2.0}))
     assert methods["verdict"].tolist() == [FAILS, OPEN]
 
@@ -316,8 +351,11 @@ def test_an_estimate_that_is_always_0_fails():
 
 def along(errors, **given):
     """Cells along three stiffnesses with an error per backend."""
-    return [cell(e, 0.9 * e, 1.1 * e, stiffness=k, backend=b, time_s=t, **given)
-            for k in (1e2, 1e3, 1e4) for b, (e, t) in errors.items()]  # fmt: skip
+    return [
+        cell(e, 0.9 * e, 1.1 * e, stiffness=k, backend=b, time_s=t, **given)
+        for k in (1e2, 1e3, 1e4)
+        for b, (e, t) in errors.items()
+    ]
 
 
 def test_a_chart_shows_the_backends_that_its_experiment_compares():
@@ -371,8 +409,10 @@ def test_two_values_of_an_axis_are_joined_by_an_arrow_and_below_are_the_costs_of
     given = {"sweep": {"stiffness": [1e2, 1e3, 1e4]}, "compares": {"stiffness": [1e2, 1e4], "estimators": ["fobg"]}}
     cells = along({"jax": (0.1, 1e-3)})
     assert len(charts_of(table(cells), **given)["contrast"].y) == 1
-    costs = [one | {"cost": one["stiffness"], "cost_low": 1.0, "cost_high": 2e4}
-             for one in along({"jax": (0.2, 1e-3)}, estimator="reinforce")]  # fmt: skip
+    costs = [
+        one | {"cost": one["stiffness"], "cost_low": 1.0, "cost_high": 2e4}
+        for one in along({"jax": (0.2, 1e-3)}, estimator="reinforce")
+    ]
     chart = charts_of(table([*cells, *costs]), **given)["contrast"]
     assert chart.frame["series"].unique().tolist() == ["fobg"]
     assert chart.frame["cost"].tolist() == chart.frame["stiffness"].tolist() == [1e2, 1e4]

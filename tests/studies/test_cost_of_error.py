@@ -146,8 +146,17 @@ def test_interval_of_a_median_has_the_order_statistics_of_the_tables(n, low, hig
 
 
 def planted(scene, kind, dose, updates, problem=""):
-    return {"problem": f"{scene}{problem}", "scene": scene, "scene_class": "smooth", "kind": kind, "method": kind, "dose": dose, "error": dose, "target": 100.0,
-            "median": updates}  # fmt: skip
+    return {
+        "problem": f"{scene}{problem}",
+        "scene": scene,
+        "scene_class": "smooth",
+        "kind": kind,
+        "method": kind,
+        "dose": dose,
+        "error": dose,
+        "target": 100.0,
+        "median": updates,
+    }
 
 
 def compared(lines, comparison, scene_class="smooth"):
@@ -172,8 +181,11 @@ def test_ratios_are_those_of_the_same_problem_and_missed_targets_count():
 @pytest.mark.parametrize(("scenes", "verdict"), [(6, "above 1"), (5, "not known")])
 def test_a_verdict_counts_scenes_and_not_problems(scenes, verdict):
     """Forty problems with the same outcome are no evidence if they are of five scenes: a fair coin gives that in one of 16."""
-    lines = [planted(f"s{i % scenes}", kind, dose, updates, f", T={i}") for i in range(40)
-             for kind, dose, updates in ((analysis.RANDOM, 0.3, 10.0), (analysis.RANDOM, 3.0, 20.0 + i))]  # fmt: skip
+    lines = [
+        planted(f"s{i % scenes}", kind, dose, updates, f", T={i}")
+        for i in range(40)
+        for kind, dose, updates in ((analysis.RANDOM, 0.3, 10.0), (analysis.RANDOM, 3.0, 20.0 + i))
+    ]
     line = compared(lines, "random error 3 / 0.3")
     assert (line["problems"], line["scenes"], line["above"], line["verdict"]) == (40, scenes, scenes, verdict)
     assert len(views._ratios(line.to_frame().T.infer_objects().assign(comparison="")).frame) == 1, (

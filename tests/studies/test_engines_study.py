@@ -19,10 +19,21 @@ TOYS = Path(__file__).resolve().parents[1] / "engines" / "toys"
 def results(tmp_path_factory):
     folder = tmp_path_factory.mktemp("results")
     words = [
-        "name=own", "study=engines", f"plugins={TOYS}", "scenes=[bouncing_ball]", "contacts=[penalty]",
-        f"backends=[numpy,'toy[python={sys.executable}]']", "scene.bouncing_ball.horizon=40", "samples=4", "repeats=4",
-        "reference.samples=256", "reference.tolerance=1", "workers=0", "--quiet", f"results_dir={folder}",
-    ]  # fmt: skip
+        "name=own",
+        "study=engines",
+        f"plugins={TOYS}",
+        "scenes=[bouncing_ball]",
+        "contacts=[penalty]",
+        f"backends=[numpy,'toy[python={sys.executable}]']",
+        "scene.bouncing_ball.horizon=40",
+        "samples=4",
+        "repeats=4",
+        "reference.samples=256",
+        "reference.tolerance=1",
+        "workers=0",
+        "--quiet",
+        f"results_dir={folder}",
+    ]
     assert main(words) == 0
     close_engines()
     return folder / "own"
@@ -74,8 +85,18 @@ def test_shares_of_the_time_are_of_engines_in_another_python_only(results):
 )
 def test_levels_of_a_gradient(expected, changes):
     good = {
-        "status": "ok", "gradient": [1.0], "program_error_rel": 1e-6, "model_error_rel": 0.01, "rmse_rel": 0.2,
-        "bias_low": 0.0, "bias_high": 0.05, "variance": 0.04, "nan_share": 0.0, "repeats": 8, "reference_se": 0.02, "reference_norm": 1.0,
-    }  # fmt: skip
+        "status": "ok",
+        "gradient": [1.0],
+        "program_error_rel": 1e-6,
+        "model_error_rel": 0.01,
+        "rmse_rel": 0.2,
+        "bias_low": 0.0,
+        "bias_high": 0.05,
+        "variance": 0.04,
+        "nan_share": 0.0,
+        "repeats": 8,
+        "reference_se": 0.02,
+        "reference_norm": 1.0,
+    }
     assert levels(pd.DataFrame([good | changes])) == [expected]
     assert expected in LEVELS

@@ -180,8 +180,13 @@ def pendulum(tmp_path, friction=0.0, times=None, drag=0.2, angle=1.0):
     times = 0.02 * np.arange(301) if times is None else times
     motion = solve_ivp(
         lambda t, x: [x[1], -9.81 / 0.5 * math.sin(x[0]) - drag * x[1] - friction * math.tanh(1e3 * x[1])],
-        (0.0, times[-1]), [angle, 0.0], t_eval=times, rtol=1e-9, atol=1e-11, max_step=0.005,
-    )  # fmt: skip
+        (0.0, times[-1]),
+        [angle, 0.0],
+        t_eval=times,
+        rtol=1e-9,
+        atol=1e-11,
+        max_step=0.005,
+    )
     noise = np.random.default_rng(4).standard_normal((2, len(times)))
     angle_, rate = np.degrees(motion.y + [[0.003], [0.03]] * noise)
     table = pd.DataFrame({"ms": 1000 * times, "angle_deg": angle_, "rate": rate, "torque": 0.0, "heat": 20 + noise[0]})
@@ -244,9 +249,7 @@ def test_estimates_come_first_and_only_what_is_identifiable_has_one(tmp_path):
     estimates, unnoticed = table_of(*SPRING, f"study=identify[record={tmp_path / 'own.csv'}]")
     assert list(estimates.index) == ["stiffness/mass", "damping/mass", "mass", "stiffness", "damping"]
     assert estimates["unit"].tolist() == ["(N/m)/kg", "(N s/m)/kg", "kg", "N/m", "N s/m"]
-    assert estimates["identifiable"].tolist() == [
-        "yes", "yes", "product", "product", "product"
-    ]  # fmt: skip
+    assert estimates["identifiable"].tolist() == ["yes", "yes", "product", "product", "product"]
     assert estimates["estimate"].isna().tolist() == [False] * 2 + [True] * 3
     assert estimates.loc["damping/mass", "estimate_low"] < 0.5 < estimates.loc["damping/mass", "estimate_high"]
     assert estimates["start"].tolist() == pytest.approx([4.0, 0.4, 1.2, 4.8, 0.48])

@@ -94,10 +94,18 @@ def test_a_saddle_at_the_start_is_left_and_named(tmp_path, start, least, saddle)
 # ------------------------------------------------------------------------------------------------------ a search
 
 WORDS = [
-    "name=small", "study=optimise[budget=600,gradient_cost=1]", "scenes=[quadratic]", "backends=[numpy]",
-    "estimators=[fobg,reinforce]", "optimizers=[gradient_descent,cem[population=20,elites=5]]", "sweep.rate=[0.01,0.1]",
-    "sweep.seed=[0,1]", "samples=8", "repeats=4", "workers=0",
-]  # fmt: skip
+    "name=small",
+    "study=optimise[budget=600,gradient_cost=1]",
+    "scenes=[quadratic]",
+    "backends=[numpy]",
+    "estimators=[fobg,reinforce]",
+    "optimizers=[gradient_descent,cem[population=20,elites=5]]",
+    "sweep.rate=[0.01,0.1]",
+    "sweep.seed=[0,1]",
+    "samples=8",
+    "repeats=4",
+    "workers=0",
+]
 
 
 BARE = ["name=none", "scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg]", "optimizers=[adam]", "workers=0"]
@@ -259,12 +267,26 @@ def test_a_method_beats_the_baseline_in_the_share_of_pairs_that_it_wins():
 def raced(rates, scenes):
     """Searches whose only target is reached by a share of ten seeds, by method and problem; a problem's scene is its name's start."""
     rows = [
-        {"problem": f"{scene}[{i}]", "scene": f"{scene}[{i}]", "method": method, "tuning": "", "seed": seed,
-         "status": "ok", "best_known": 0.0, "start_cost": 1.0, "final_cost": float(seed >= 10 * rate), "ratio": 1.0,
-         "score": float(seed < 10 * rate), "path_rollouts": [0, 1], "path_gradients": [0, 0],
-         "path_cost": [1.0, 1e-9 if seed < 10 * rate else 1.0]}
-        for method, given in rates.items() for i, (scene, rate) in enumerate(zip(scenes, given, strict=True)) for seed in range(10)
-    ]  # fmt: skip
+        {
+            "problem": f"{scene}[{i}]",
+            "scene": f"{scene}[{i}]",
+            "method": method,
+            "tuning": "",
+            "seed": seed,
+            "status": "ok",
+            "best_known": 0.0,
+            "start_cost": 1.0,
+            "final_cost": float(seed >= 10 * rate),
+            "ratio": 1.0,
+            "score": float(seed < 10 * rate),
+            "path_rollouts": [0, 1],
+            "path_gradients": [0, 0],
+            "path_cost": [1.0, 1e-9 if seed < 10 * rate else 1.0],
+        }
+        for method, given in rates.items()
+        for i, (scene, rate) in enumerate(zip(scenes, given, strict=True))
+        for seed in range(10)
+    ]
     return studied.RunSet(pd.DataFrame(rows))
 
 

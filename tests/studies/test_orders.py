@@ -24,8 +24,14 @@ def ends(*words):
 def test_only_the_time_of_impact_teaches_two_balls_to_strike(words, known):
     """Within 1% of J* = 1.39654 with the time of impact; without it descent learns to do nothing, which costs 2."""
     found = ends(
-        "scenes=[two_balls[horizon=480,dt=0.0020833333333333333,sigma=1e-12]]", "backends=[jax]", "samples=1", "name=balls",
-        "study=optimise[iterations=120,quality=none,budget=100000000]", "estimators=[fobg]", "timing=false",
-        "optimizers=[gradient_descent[rate=100]]", *words,
-    )  # fmt: skip
+        "scenes=[two_balls[horizon=480,dt=0.0020833333333333333,sigma=1e-12]]",
+        "backends=[jax]",
+        "samples=1",
+        "name=balls",
+        "study=optimise[iterations=120,quality=none,budget=100000000]",
+        "estimators=[fobg]",
+        "timing=false",
+        "optimizers=[gradient_descent[rate=100]]",
+        *words,
+    )
     assert [one["final_cost"] for one in found] == pytest.approx(known, rel=2e-3)

@@ -34,9 +34,13 @@ def measured(*words):
 def swept(integrator, *words):
     """Rows of mass_spring over STIFFNESS at one dt, which compiles once."""
     return measured(
-        "scenes=[mass_spring]", f"integrators=[{integrator}]", f"sweep.stiffness={list(STIFFNESS)}",
-        f"scene.mass_spring.horizon={HORIZON}", f"scene.mass_spring.dt={DT}", *words,
-    )  # fmt: skip
+        "scenes=[mass_spring]",
+        f"integrators=[{integrator}]",
+        f"sweep.stiffness={list(STIFFNESS)}",
+        f"scene.mass_spring.horizon={HORIZON}",
+        f"scene.mass_spring.dt={DT}",
+        *words,
+    )
 
 
 def agrees(rows):
@@ -185,9 +189,13 @@ def test_a_theta_that_depends_on_the_horizon_has_no_finer_step(words):
 
 def test_contact_springs_are_oscillators_while_they_last():
     _, (cell,) = cells_of(
-        "scenes=[bouncing_ball]", "contacts=[penalty]", "integrators=[semi_implicit_euler]",
-        "scene.bouncing_ball.mass=2", "contact.penalty.damping=4", "contact.penalty.stiffness=100",
-    )  # fmt: skip
+        "scenes=[bouncing_ball]",
+        "contacts=[penalty]",
+        "integrators=[semi_implicit_euler]",
+        "scene.bouncing_ball.mass=2",
+        "contact.penalty.damping=4",
+        "contact.penalty.stiffness=100",
+    )
     assert stability.oscillator(cell) == (50.0, 2.0, 1.0)
     # a step is stable up to dt^2 k = 4 - 2 dt c, with k and c per unit of mass
     dt = cell.scene.dt

@@ -14,9 +14,20 @@ from bench.report.writer import table_files
 
 EXAMPLE = ROOT / "examples" / "cost_of_error"
 FAST = {
-    "backward_memory", "dose_response/controls", "engine_gradients", "horizon_growth", "identify", "optimise/small", "quadruped_check",
-    "quick", "solver_iterations", "stability_map", "three_errors", "train/half_cheetah", "twins",
-}  # fmt: skip
+    "backward_memory",
+    "dose_response/controls",
+    "engine_gradients",
+    "horizon_growth",
+    "identify",
+    "optimise/small",
+    "quadruped_check",
+    "quick",
+    "solver_iterations",
+    "stability_map",
+    "three_errors",
+    "train/half_cheetah",
+    "twins",
+}
 """An experiment of each study."""
 NAMES = {
     path.relative_to(folder).with_suffix("").as_posix(): words

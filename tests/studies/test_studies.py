@@ -78,10 +78,19 @@ def checked(*words):
     given, rows = unmeasured("study=gradient_check", "backends=[jax,torch]", "estimators=[fobg]", *words)
     eps = EPS[:2]
     values = {
-        "point": ["start"], "sample": [0], "direction": [0], "derivative_program": [1.0], "check_verdict": ["smooth"],
-        "check_error": [1e-9], "check_eps": [1e-4], "eps": list(eps), "derivative_differences": [1.0, 1.0],
-        "relative_error": [1e-9, 1e-8], "mode_minus": ["", ""], "mode_plus": ["", ""],
-    } | {name: [0] for name in gradient_check.PER_COMPONENT}  # fmt: skip
+        "point": ["start"],
+        "sample": [0],
+        "direction": [0],
+        "derivative_program": [1.0],
+        "check_verdict": ["smooth"],
+        "check_error": [1e-9],
+        "check_eps": [1e-4],
+        "eps": list(eps),
+        "derivative_differences": [1.0, 1.0],
+        "relative_error": [1e-9, 1e-8],
+        "mode_minus": ["", ""],
+        "mode_plus": ["", ""],
+    } | {name: [0] for name in gradient_check.PER_COMPONENT}
     given = replace(given, plugins=())  # of another test in this process
     return given, rows.assign(verdict="smooth", **{name: [value] * len(rows) for name, value in values.items()})
 
@@ -121,14 +130,27 @@ def mapped(*words):
 @pytest.mark.parametrize(
     ("words", "maps"),
     [
-        (["scenes=[mass_spring]", "sweep.zip.dt=[0.1,0.05]", "sweep.zip.horizon=[10,20]", "sweep.mass_spring.damping=[0,1]"],
-         ["mass_spring, damping=0", "mass_spring, damping=1"]),
+        (
+            [
+                "scenes=[mass_spring]",
+                "sweep.zip.dt=[0.1,0.05]",
+                "sweep.zip.horizon=[10,20]",
+                "sweep.mass_spring.damping=[0,1]",
+            ],
+            ["mass_spring, damping=0", "mass_spring, damping=1"],
+        ),
         # a swept number that equals a stiffness
-        (["scenes=[mass_spring]", "sweep.mass_spring.damping=[10,100]"], ["mass_spring, damping=10", "mass_spring, damping=100"]),
+        (
+            ["scenes=[mass_spring]", "sweep.mass_spring.damping=[10,100]"],
+            ["mass_spring, damping=10", "mass_spring, damping=100"],
+        ),
         # sigma has a column of its own, and so is in no identity string
-        (["scenes=['mass_spring[sigma=0.1]','mass_spring[sigma=0.2]']"], ["mass_spring, sigma=0.1", "mass_spring, sigma=0.2"]),
+        (
+            ["scenes=['mass_spring[sigma=0.1]','mass_spring[sigma=0.2]']"],
+            ["mass_spring, sigma=0.1", "mass_spring, sigma=0.2"],
+        ),
     ],
-)  # fmt: skip
+)
 def test_maps_are_apart_by_parameters(words, maps):
     given, rows = mapped("sweep.stiffness=[10,100]", *words)
     cells = cells_of(given, rows)

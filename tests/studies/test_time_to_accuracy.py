@@ -29,16 +29,32 @@ VARIANCE = 4.0
 def rows(bias=0.0, resolved=None, **values):
     """Rows of a method with that law, 1 ms a sample, for a gradient of norm 2."""
     resolved = bias > 0 if resolved is None else resolved
-    return pd.DataFrame([
-        row(**{
-            "backend": "b", "estimator": "e", "draws": "iid", "repeats": 8, "samples": float(n), "reference_norm": 2.0, "bias": 2 * bias,
-            "bias_low": 1.9 * bias if resolved else 0.0, "bias_high": 2.1 * bias,
-            **dict.fromkeys(("variance", "variance_low", "variance_high"), 4 * VARIANCE / n),
-            "rmse": 2 * math.sqrt(bias**2 + VARIANCE / n), "rmse_rel": math.sqrt(bias**2 + VARIANCE / n), "time_s": 1e-3 * n,
-            "time_iqr_s": 0.0, "rollouts": float(n), "gradients": float(n),
-        } | values)
-        for n in SAMPLES
-    ])  # fmt: skip
+    return pd.DataFrame(
+        [
+            row(
+                **{
+                    "backend": "b",
+                    "estimator": "e",
+                    "draws": "iid",
+                    "repeats": 8,
+                    "samples": float(n),
+                    "reference_norm": 2.0,
+                    "bias": 2 * bias,
+                    "bias_low": 1.9 * bias if resolved else 0.0,
+                    "bias_high": 2.1 * bias,
+                    **dict.fromkeys(("variance", "variance_low", "variance_high"), 4 * VARIANCE / n),
+                    "rmse": 2 * math.sqrt(bias**2 + VARIANCE / n),
+                    "rmse_rel": math.sqrt(bias**2 + VARIANCE / n),
+                    "time_s": 1e-3 * n,
+                    "time_iqr_s": 0.0,
+                    "rollouts": float(n),
+                    "gradients": float(n),
+                }
+                | values
+            )
+            for n in SAMPLES
+        ]
+    )
 
 
 GIVEN = config.load(["sweep.samples=[16,64,256]"])
@@ -143,9 +159,7 @@ def test_samples_that_are_coupled_are_not_extrapolated(given):
 
 def better(times, **values):
     """Rows whose error is smaller by a factor."""
-    return rows(**values).assign(
-        rmse_rel=lambda r: r["rmse_rel"] / times, variance=lambda r: r["variance"] / times**2
-    )  # fmt: skip
+    return rows(**values).assign(rmse_rel=lambda r: r["rmse_rel"] / times, variance=lambda r: r["variance"] / times**2)
 
 
 def slower(times, **values):

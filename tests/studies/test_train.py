@@ -24,14 +24,36 @@ def made_up(final=FINAL, seeds=range(5), spread=10.0, **columns):
         last = final[row["trainer"]] + spread * rng.standard_normal()
         curve = [-2000.0, -1200.0, last]
         window = getattr(cell.parts["trainer"], "window", np.nan)
-        rows.append(row | {
-            "status": "ok", "first_return": -2000.0, "final_return": last, "steps": 1e6, "updates": 500, "train_s": 30.0,
-            "compile_s": 9.0, "gradient_typical": 1.0, "gradient_peak": 5.0, "curve_return": curve,
-            "curve_return_low": curve, "curve_return_high": curve, "curve_step": [0, 5e5, 1e6], "curve_update": [0, 250, 500], "curve_s": [0.0, 15.0, 30.0],
-            "window_gradient": 10.0, "window_bias": 10.0 / window, "window_bias_low": 9.0 / window, "window_bias_high": 11.0 / window,
-            "log_update": [250, 500], "log_reward": [-8.0, -3.0], "log_gradient_norm": [1.0, 5.0],
-            "cosine_update": [100, 300], "cosine": [0.9, 0.8],
-        } | columns)  # fmt: skip
+        rows.append(
+            row
+            | {
+                "status": "ok",
+                "first_return": -2000.0,
+                "final_return": last,
+                "steps": 1e6,
+                "updates": 500,
+                "train_s": 30.0,
+                "compile_s": 9.0,
+                "gradient_typical": 1.0,
+                "gradient_peak": 5.0,
+                "curve_return": curve,
+                "curve_return_low": curve,
+                "curve_return_high": curve,
+                "curve_step": [0, 5e5, 1e6],
+                "curve_update": [0, 250, 500],
+                "curve_s": [0.0, 15.0, 30.0],
+                "window_gradient": 10.0,
+                "window_bias": 10.0 / window,
+                "window_bias_low": 9.0 / window,
+                "window_bias_high": 11.0 / window,
+                "log_update": [250, 500],
+                "log_reward": [-8.0, -3.0],
+                "log_gradient_norm": [1.0, 5.0],
+                "cosine_update": [100, 300],
+                "cosine": [0.9, 0.8],
+            }
+            | columns
+        )
     return experiment, experiment.columns.typed(pd.DataFrame(rows))
 
 

@@ -11,9 +11,13 @@ def rows():
     """Right with little spread, wrong with much, wrong with none (the mean is 0), and right with a remark."""
     made = table([row(seed=i) for i in range(4)])
     return made.assign(
-        rmse_rel=[0.1, 2.0, 1.0, 0.2], grad_norm=[1.0, 1.0, 0.0, 1.0], variance=[0.01, 4.0, 0.0, 0.04],
-        bias=[0.0, 0.0, 1.0, 0.0], reference_norm=1.0, reason=["", "", "", "heavy tails"],
-    )  # fmt: skip
+        rmse_rel=[0.1, 2.0, 1.0, 0.2],
+        grad_norm=[1.0, 1.0, 0.0, 1.0],
+        variance=[0.01, 4.0, 0.0, 0.04],
+        bias=[0.0, 0.0, 1.0, 0.0],
+        reference_norm=1.0,
+        reason=["", "", "", "heavy tails"],
+    )
 
 
 def test_the_rule_counts_what_it_trusts_and_what_it_holds_back():

@@ -10,8 +10,17 @@ from bench.model import registry
 from bench.run.session import RunSession
 
 STUDIES = {name: entry.plugin for name, entry in registry.entries()["studies"].items() if entry.plugin is not None}
-JUDGED = ("bias", "bias_rel", "rmse", "rmse_rel", "cosine", "zeroth_rmse_rel", "quality_bias_share", "quality_rmse_rel",
-          "quality_cosine")  # fmt: skip
+JUDGED = (
+    "bias",
+    "bias_rel",
+    "rmse",
+    "rmse_rel",
+    "cosine",
+    "zeroth_rmse_rel",
+    "quality_bias_share",
+    "quality_rmse_rel",
+    "quality_cosine",
+)
 """Columns that judge estimates of grad J_sigma, and so stand on its certified reference."""
 OF_OTHERS = {"stability": {"cosine"}, "identify": {"bias"}, "train": {"cosine"}}
 """Columns of these names that judge something else, by study: a single gradient, a fit, or gradients of both orders."""

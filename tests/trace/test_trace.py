@@ -224,17 +224,24 @@ def test_spikes_near_switches_are_counted_against_chance(spike_at, switch_at, fo
 @pytest.mark.slow
 def test_command_writes_table_and_chart(tmp_path, capsys):
     words = [
-        "trace", "pushing", "double_integrator", "contacts=[penalty]", "contact.penalty.stiffness=1e4",
-        "scene.pushing.horizon=60", "seed=1", f"results_dir={tmp_path}",
-    ]  # fmt: skip
+        "trace",
+        "pushing",
+        "double_integrator",
+        "contacts=[penalty]",
+        "contact.penalty.stiffness=1e4",
+        "scene.pushing.horizon=60",
+        "seed=1",
+        f"results_dir={tmp_path}",
+    ]
     assert main(words) == 0
     printed = capsys.readouterr().out
     assert ": spikes line up with contact switches (" in printed
     for scene, steps in (("pushing", 60), ("double_integrator", 20)):
         directory = tmp_path / "trace" / scene
         assert sorted(path.name for path in directory.iterdir()) == [
-            "trace.csv", "trace.png",
-        ]  # fmt: skip
+            "trace.csv",
+            "trace.png",
+        ]
         table = pd.read_csv(directory / "trace.csv")
         assert tuple(table.columns[: len(COLUMNS)]) == COLUMNS
         assert len(table) == steps + 1

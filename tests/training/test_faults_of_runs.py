@@ -62,7 +62,7 @@ PLANTED = {
     "a soft contact": ({"log_penetration": DEEPER}, "soft_contact", None),
     "parameters that grow 90 times": (entries("log_parameter_largest", slice(60, None), 90.0), "parameters", 61),
     "a small deviation": (entries("log_deviation", slice(80, None), 1e-5), "deviation", 81),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", PLANTED)
@@ -89,7 +89,7 @@ HARMLESS = {
     "two comparisons of gradients": {"cosine": [-0.5, -0.4]},
     "a search without differences": {"slope_errors": np.nan, "cosine": []},
     "slopes that are not known": {"slope_errors": [np.nan] * 3},
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", HARMLESS)

@@ -23,9 +23,22 @@ import pandas as pd
 
 REFERENCE = Path(__file__).with_name("gpu_reference.json")
 COLUMNS = (
-    "case", "backend", "dtype", "device", "batch", "gradients_per_s", "call_s", "spread", "calls", "with_transfer_s",
-    "compile_s", "agreement", "finite", "status", "at_s",
-)  # fmt: skip
+    "case",
+    "backend",
+    "dtype",
+    "device",
+    "batch",
+    "gradients_per_s",
+    "call_s",
+    "spread",
+    "calls",
+    "with_transfer_s",
+    "compile_s",
+    "agreement",
+    "finite",
+    "status",
+    "at_s",
+)
 COMPARED, PROJECTIONS = 4, 8
 """Samples whose gradients are compared with the CPU's, and random directions on which they are projected."""
 SECONDS, CALLS = 0.5, 20
@@ -56,8 +69,11 @@ ROBOTS = {
     "half_cheetah": (f"mjcf[file={GYMNASIUM}/half_cheetah.xml,horizon=10,substeps=2]", "mjx[iterations=10]"),
     "ant": (f"mjcf[file={GYMNASIUM}/ant.xml,functions={{folder}}/ant.py,horizon=10,substeps=2]", "mjx[iterations=10]"),
     "quadruped": ("mjcf[file=quadruped.xml,horizon=10,substeps=2]", "mjx[iterations=10]"),
-    "humanoid": (f"mjcf[file={GYMNASIUM}/humanoid.xml,functions={{folder}}/humanoid.py,horizon=10,substeps=2]", "mjx[iterations=20]"),
-}  # fmt: skip
+    "humanoid": (
+        f"mjcf[file={GYMNASIUM}/humanoid.xml,functions={{folder}}/humanoid.py,horizon=10,substeps=2]",
+        "mjx[iterations=20]",
+    ),
+}
 SCENES = ("pushing", "cartpole", "double_pendulum", "hopper")
 DTYPES = ("float32", "float64")
 BATCHES = (1, 16, 64, 256, 1024, 4096, 16384)
@@ -187,8 +203,15 @@ def draw(folder):
     on = rows["device"].map({"gpu": f"one {about['device']}", "cpu": f"fused on {about['cores']} cores"})
     frame = rows.assign(series=rows["dtype"] + ", " + on)
     batch, rate = Column("batch", label="rollouts at once"), Column("gradients_per_s", label="gradients per second")
-    chart = Chart("gpu", frame, [batch], [rate], title="How many gradients a second does a GPU compute?", series="series",
-                  panel="case")  # fmt: skip
+    chart = Chart(
+        "gpu",
+        frame,
+        [batch],
+        [rate],
+        title="How many gradients a second does a GPU compute?",
+        series="series",
+        panel="case",
+    )
     with styled():
         save(drawn_chart(chart), folder / "gpu")
 
@@ -204,9 +227,12 @@ def machine():
 
     device, libraries = jax.devices()[0], (jax, jaxlib, mujoco, np)
     return {
-        "platform": device.platform, "device": device.device_kind, **{each.__name__: each.__version__ for each in libraries},
-        "cores": os.cpu_count(), "python": platform.python_version(),
-    }  # fmt: skip
+        "platform": device.platform,
+        "device": device.device_kind,
+        **{each.__name__: each.__version__ for each in libraries},
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+    }
 
 
 def main():

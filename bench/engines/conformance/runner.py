@@ -33,9 +33,20 @@ TOLERANCES = {"float64": 1e-6, "float32": 1e-3}
 WRONG = 10
 """Exit status of a script that ran and found something wrong, or judged nothing."""
 COLUMNS = (
-    "case", "term", "is_right", "digits", "ratio", "component", "expected", "obtained", "uncertainty", "looks_like",
-    "against", "seconds", "reason",
-)  # fmt: skip
+    "case",
+    "term",
+    "is_right",
+    "digits",
+    "ratio",
+    "component",
+    "expected",
+    "obtained",
+    "uncertainty",
+    "looks_like",
+    "against",
+    "seconds",
+    "reason",
+)
 
 
 @dataclass(frozen=True)

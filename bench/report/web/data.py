@@ -77,9 +77,14 @@ def _columns(own: Sequence[Column], cells: pd.DataFrame, swept: Sequence[str]) -
     order = [*identity[:IN_SIGHT], *own[:FIRST], status, *own[FIRST:], *identity[IN_SIGHT:], reason]
     flags = {"time_s": "unsteady"} if "unsteady" in cells else {}
     return [
-        {"name": c.name, "label": c.heading, "kind": "seconds" if c.format == "seconds" else c.kind, "flag": c.limit or flags.get(c.name, "")}
+        {
+            "name": c.name,
+            "label": c.heading,
+            "kind": "seconds" if c.format == "seconds" else c.kind,
+            "flag": c.limit or flags.get(c.name, ""),
+        }
         for c in order
-    ]  # fmt: skip
+    ]
 
 
 def _filters(cells: pd.DataFrame, columns: Sequence[dict[str, str]], swept: Sequence[str]) -> list[str]:

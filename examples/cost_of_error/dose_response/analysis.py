@@ -27,8 +27,13 @@ LEAST_UPDATES = 5
 CHARGES = {"1": 1.0, "2": 2.0, "4": 4.0, "measured": math.nan}
 """Rollouts that a gradient is charged as."""
 BEST, RANDOM, FIXED, TAILS, BIAS, ROTATION = (
-    "best gradient", "random error", "random error of fixed size", "heavy-tailed error", "bias", "rotation",
-)  # fmt: skip
+    "best gradient",
+    "random error",
+    "random error of fixed size",
+    "heavy-tailed error",
+    "bias",
+    "rotation",
+)
 PLANTED = (RANDOM, FIXED, TAILS, BIAS, ROTATION)
 COSTS_ONLY = "costs only"
 ORDERS = ("first order", "zeroth order")
@@ -59,12 +64,25 @@ def searches(rows: pd.DataFrame) -> pd.DataFrame:
         shape = (-1, len(TARGETS))
         times = np.nan_to_num(np.asarray(row["updates"], dtype=float), nan=np.inf).reshape(shape[::-1])
         by_rate = np.nan_to_num(np.asarray(row["rate_updates"], dtype=float), nan=np.inf).reshape(shape)
-        lines += [{
-            "problem": problem_name(row), "scene": row["scene"], "scene_class": row["scene_class"], "kind": kind,
-            "method": _method(row, kind), "dose": dose, "target": target, "times": times[k], "median": float(np.median(times[k])),
-            "samples": row["samples"], "rates": np.asarray(row["rates"], dtype=float), "by_rate": by_rate[:, k],
-            "best_rate": row["best_rates"][k], **{name: row[name] for name in MEASURED},
-        } for k, target in enumerate(TARGETS)]  # fmt: skip
+        lines += [
+            {
+                "problem": problem_name(row),
+                "scene": row["scene"],
+                "scene_class": row["scene_class"],
+                "kind": kind,
+                "method": _method(row, kind),
+                "dose": dose,
+                "target": target,
+                "times": times[k],
+                "median": float(np.median(times[k])),
+                "samples": row["samples"],
+                "rates": np.asarray(row["rates"], dtype=float),
+                "by_rate": by_rate[:, k],
+                "best_rate": row["best_rates"][k],
+                **{name: row[name] for name in MEASURED},
+            }
+            for k, target in enumerate(TARGETS)
+        ]
     table = pd.DataFrame(lines)
     if table.empty:
         return table

@@ -50,9 +50,13 @@ def measure(cell: Cell, session: Session, settings: DoseResponse) -> dict[str, A
         n_tuning, n_runs = (settings.tuning_seeds, settings.seeds) if method.is_random else (1, 1)
         seeds, scale = 100_000 * cell.seed + np.arange(n_runs), unit_rate(method.optimizer, first)
         tuning = tune(
-            problem, task, method, (100_000 * cell.seed + TUNING_SEED + np.arange(n_tuning)).tolist(),
-            [scale * rate for rate in settings.grid()], settings.widenings,
-        )  # fmt: skip
+            problem,
+            task,
+            method,
+            (100_000 * cell.seed + TUNING_SEED + np.arange(n_tuning)).tolist(),
+            [scale * rate for rate in settings.grid()],
+            settings.widenings,
+        )
         best = list(dict.fromkeys(tuning.best))
         methods = [with_rate(method, tuning.rates[place]) for place in best for _ in seeds]
         results = run_searches(problem, task, methods, seeds.tolist() * len(best))
@@ -60,16 +64,28 @@ def measure(cell: Cell, session: Session, settings: DoseResponse) -> dict[str, A
         errors = errors_on_path(cell, problem, method, ground) if method.estimator is not None else {}
     updates = [search.updates[k] for k, place in enumerate(tuning.best) for search in searches[place]]
     return {
-        "status": "ok", "reason": "", "scene_class": scene_class(cell, problem), "start_cost": ground.start,
-        "optimum": ground.optimum, "optimum_status": ground.how, "budget": settings.iterations, "runs": n_runs,
-        "updates": _finite(updates), "best_rates": [tuning.rates[place] for place in tuning.best],
-        "is_inside": [float(inside) for inside in tuning.is_inside], "rates": tuning.rates,
-        "rate_updates": _finite(tuning.updates.ravel()), "tuning_rollouts": tuning.rollouts,
-        "tuning_gradients": tuning.gradients, "rollouts_per_update": float(np.mean([s.rollouts for s in results])),
+        "status": "ok",
+        "reason": "",
+        "scene_class": scene_class(cell, problem),
+        "start_cost": ground.start,
+        "optimum": ground.optimum,
+        "optimum_status": ground.how,
+        "budget": settings.iterations,
+        "runs": n_runs,
+        "updates": _finite(updates),
+        "best_rates": [tuning.rates[place] for place in tuning.best],
+        "is_inside": [float(inside) for inside in tuning.is_inside],
+        "rates": tuning.rates,
+        "rate_updates": _finite(tuning.updates.ravel()),
+        "tuning_rollouts": tuning.rollouts,
+        "tuning_gradients": tuning.gradients,
+        "rollouts_per_update": float(np.mean([s.rollouts for s in results])),
         "gradients_per_update": float(np.mean([s.gradients for s in results])),
         "lowest": float(np.median([s.lowest for s in searches[tuning.best[-1]]])),
-        "hypotheses": hypotheses_hash(), **_times(cell, problem), **errors,
-    }  # fmt: skip
+        "hypotheses": hypotheses_hash(),
+        **_times(cell, problem),
+        **errors,
+    }
 
 
 def _finite(values: Iterable[float]) -> list[float]:

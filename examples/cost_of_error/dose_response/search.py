@@ -97,9 +97,12 @@ def follow(problem: Problem, method: Method, task: Task, seed: int, keep: bool =
         place = (seed, i) if method.is_random else (0, 0)
         drawn = _noise(place[0], task.scene, method.samples, width, place[1]).copy(order="K")  # methods share the noise
         state = advance(
-            optimizer, state, normal, partial(mean_costs, problem, w=task.scored),
+            optimizer,
+            state,
+            normal,
+            partial(mean_costs, problem, w=task.scored),
             partial(estimates, problem, method.estimator, w=drawn),
-        )  # fmt: skip
+        )
     share = 1.0 / max(i, 1)
     return Search(updates, problem.usage.rollouts * share, problem.usage.gradients * share, lowest, i, thetas)
 
@@ -191,9 +194,13 @@ def tune(
         rates = sorted([*rates, *wider])
     everything = [search for some in found.values() for search in some]
     return Tuning(
-        rates, updates, best, sum(s.rollouts * s.steps for s in everything), sum(s.gradients * s.steps for s in everything),
+        rates,
+        updates,
+        best,
+        sum(s.rollouts * s.steps for s in everything),
+        sum(s.gradients * s.steps for s in everything),
         [not name or 0 < b < len(rates) - 1 for b in best],
-    )  # fmt: skip
+    )
 
 
 def with_rate(method: Method, rate: float) -> Method:

@@ -30,9 +30,14 @@ CLASS, PROBLEMS, SCENES = (
     Column("scenes", format="setting"),
 )
 PAIRS = (
-    CLASS, text("comparison"), PROBLEMS, SCENES, Column("above", label="above 1", format="setting"),
-    interval("ratio", boundary=1.0), text("verdict"),
-)  # fmt: skip
+    CLASS,
+    text("comparison"),
+    PROBLEMS,
+    SCENES,
+    Column("above", label="above 1", format="setting"),
+    interval("ratio", boundary=1.0),
+    text("verdict"),
+)
 PAIR_NOTES = (
     "Ratios of updates, or of rollouts between orders and samples, on the same problem, to 1/100 of the first regret. One size: over "
     "the best gradient. Median over scenes, each with the median of its problems, and its 95% interval. A verdict: the exact sign "
@@ -58,13 +63,21 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     together = main[main["scene_class"] == analysis.ALL]
     several = table["scene_class"].nunique() > 1
     tables = [
-        Table("pairs", together, PAIRS[1:], "Ratios on the same problem", PAIR_NOTES,
-              terminal=True, page=True, data=pairs),
-        Table("pairs", main[(main["scene_class"] != analysis.ALL) & several], PAIRS, "Ratios by class", PAIR_NOTES, page=True,
-              split="scene_class"),
+        Table(
+            "pairs", together, PAIRS[1:], "Ratios on the same problem", PAIR_NOTES, terminal=True, page=True, data=pairs
+        ),
+        Table(
+            "pairs",
+            main[(main["scene_class"] != analysis.ALL) & several],
+            PAIRS,
+            "Ratios by class",
+            PAIR_NOTES,
+            page=True,
+            split="scene_class",
+        ),
         Table("dose_response", csv_table(experiment, rows), [], files=["csv"]),
         _problems(table),
-    ]  # fmt: skip
+    ]
     charts = [_ratios(together)] if len(together) else []
     if len(beside):  # then the question is what such methods take
         tables, charts = [_reached(beside), *tables[2:]], [_reached_chart(beside)]
@@ -79,8 +92,12 @@ def _problems(table: pd.DataFrame) -> Table:
     names = [f"floor_{target:g}" for target in wide.columns]
     reasons_of = known[known["target"] == MAIN].set_index("problem")["reason"]
     frame = wide.set_axis(names, axis=1).reset_index().assign(reason_100=lambda f: f["problem"].map(reasons_of))
-    columns = [text("problem"), CLASS, *(Column(n, label=n.replace("floor_", "1/")) for n in names),
-               text("reason_100", label="left out at 1/100")]  # fmt: skip
+    columns = [
+        text("problem"),
+        CLASS,
+        *(Column(n, label=n.replace("floor_", "1/")) for n in names),
+        text("reason_100", label="left out at 1/100"),
+    ]
     return Table("problems", frame, columns, "Problems", PROBLEM_NOTES)
 
 
@@ -91,12 +108,20 @@ def _ratios(pairs: pd.DataFrame) -> Chart:
         comparison=pairs["comparison"] + pairs["scenes"].map(" ({})".format),
     )
     return Chart(
-        "ratios", frame, [interval("ratio", label="times the updates; of orders and samples: times the rollouts", log=True)],
-        [text("comparison", label="")], "dots", series="verdict", styles=VERDICTS, marks=[Mark("the same", 1.0)], failed="is_missed",
-        failed_name="most scenes miss the target; at the left edge: with what it is compared to", height=0.24,
+        "ratios",
+        frame,
+        [interval("ratio", label="times the updates; of orders and samples: times the rollouts", log=True)],
+        [text("comparison", label="")],
+        "dots",
+        series="verdict",
+        styles=VERDICTS,
+        marks=[Mark("the same", 1.0)],
+        failed="is_missed",
+        failed_name="most scenes miss the target; at the left edge: with what it is compared to",
+        height=0.24,
         subtitle=f"to 1/{MAIN:g} of the first regret, median over scenes, whose number is in brackets; an error alone is compared to the best gradient. "
-                 "Gradient 2: it counts as two rollouts",
-    )  # fmt: skip
+        "Gradient 2: it counts as two rollouts",
+    )
 
 
 def _reached(known: pd.DataFrame) -> Table:
@@ -105,8 +130,16 @@ def _reached(known: pd.DataFrame) -> Table:
     order = known.set_index(["problem", "scene_class"]).index.drop_duplicates()
     wide = wide.loc[order, list(dict.fromkeys(known["method"]))].reset_index()
     columns = [text("problem"), CLASS, *(Column(name, label=name) for name in wide.columns[2:])]
-    return Table("reached", wide, columns, "Rollouts and gradients to 1/100 of the first regret", REACHED_NOTES,
-                 terminal=True, page=True, data=known.drop(columns="missed"))  # fmt: skip
+    return Table(
+        "reached",
+        wide,
+        columns,
+        "Rollouts and gradients to 1/100 of the first regret",
+        REACHED_NOTES,
+        terminal=True,
+        page=True,
+        data=known.drop(columns="missed"),
+    )
 
 
 def _reached_chart(known: pd.DataFrame) -> Chart:
@@ -116,8 +149,25 @@ def _reached_chart(known: pd.DataFrame) -> Chart:
     most = known.groupby("problem")["rollouts_per_update"].transform("max")
     names = known["problem"].map(short_names(known["problem"])) + most.map(" ({:,.0f})".format)
     return Chart(
-        "reached", known.assign(problem=names), [Column("evaluations", label="rollouts and gradients to 1/100", low="fewest", high="most", ends="range of the searches", log=True)],
-        [text("problem", label="")], "dots", series="method", styles=looks, failed="missed", failed_name="most searches miss it", height=0.55,
+        "reached",
+        known.assign(problem=names),
+        [
+            Column(
+                "evaluations",
+                label="rollouts and gradients to 1/100",
+                low="fewest",
+                high="most",
+                ends="range of the searches",
+                log=True,
+            )
+        ],
+        [text("problem", label="")],
+        "dots",
+        series="method",
+        styles=looks,
+        failed="missed",
+        failed_name="most searches miss it",
+        height=0.55,
         subtitle=f"to 1/{MAIN:g} of the first regret, each method at its best rate, median of searches; in brackets the rollouts that an update takes without a gradient",
         text="A bar reaches the edge where a search misses the target. A gradient counts as one rollout.",
-    )  # fmt: skip
+    )

@@ -46,13 +46,25 @@ FIRST = "first, or tied: the 95% interval of its factor to the first reaches 1"
 PANELS = 4
 """Most problems of a chart along an axis."""
 RMSE = Column(
-    "rmse_rel", label="relative RMSE of one estimate", low="rmse_low", high="rmse_high", limit="rmse_limit", log=True, least=FLOOR,
+    "rmse_rel",
+    label="relative RMSE of one estimate",
+    low="rmse_low",
+    high="rmse_high",
+    limit="rmse_limit",
+    log=True,
+    least=FLOOR,
     above_one="worse than the zero estimate",
-)  # fmt: skip
+)
 BIAS = Column(
-    "bias_shown", label="relative bias", low="bias_from", high="bias_to", limit="bias_limit", log=True, least=FLOOR,
+    "bias_shown",
+    label="relative bias",
+    low="bias_from",
+    high="bias_to",
+    limit="bias_limit",
+    log=True,
+    least=FLOOR,
     above_one="larger than the gradient",
-)  # fmt: skip
+)
 COST = interval("cost", log=False, ends="95% of the rollouts")
 SECONDS = replace(COLUMNS.by_name["time_s"], label="time of one estimate", log=True)
 FASTEST = "each estimator on its fastest backend"
@@ -118,10 +130,14 @@ def _conditions(shown: Arranged) -> str:
     rows = shown.rows
     scenes, samples, seeds = (rows[name].unique() for name in ("scene", "samples", "seed"))
     laws = rows.loc[rows["reason"].str.contains(SURROGATE, regex=False), "contact"].unique()
-    return ", ".join([
-        *[*short_names(scenes).values()] * (len(scenes) == 1), *[f"{samples[0]:g} samples"] * (len(samples) == 1),
-        *[f"medians over {len(seeds)} seeds"] * (len(seeds) > 1), *(f"{law}: {SURROGATE}" for law in laws),
-    ])  # fmt: skip
+    return ", ".join(
+        [
+            *[*short_names(scenes).values()] * (len(scenes) == 1),
+            *[f"{samples[0]:g} samples"] * (len(samples) == 1),
+            *[f"medians over {len(seeds)} seeds"] * (len(seeds) > 1),
+            *(f"{law}: {SURROGATE}" for law in laws),
+        ]
+    )
 
 
 # ---------------------------------------------------------------------------------------------- along an axis
@@ -154,12 +170,20 @@ def _along(
     if axis.column == "samples" and compared == "contact":
         stem, what, y = "time", "time", [SECONDS]
     return Chart(
-        f"{stem}_" + re.sub(r"\W", "_", axis.column), frame, [Column("x", label=axis.title, format="setting")], y, series="series",
+        f"{stem}_" + re.sub(r"\W", "_", axis.column),
+        frame,
+        [Column("x", label=axis.title, format="setting")],
+        y,
+        series="series",
         title=f"How does the {what} of one estimate depend on {axis.column.replace('_', ' ')}?",
-        panel="panel", marks=marks, failed="failed", across=len(names) if compared else len(drawn),
-        height=2.7 if len(drawn) <= 2 else 2.1, styles=_looks(frame["series"].unique() if compared else ()),
+        panel="panel",
+        marks=marks,
+        failed="failed",
+        across=len(names) if compared else len(drawn),
+        height=2.7 if len(drawn) <= 2 else 2.1,
+        styles=_looks(frame["series"].unique() if compared else ()),
         subtitle=", ".join(filter(None, [subtitle, *notes, *shares])),
-    )  # fmt: skip
+    )
 
 
 def _is_named(found: pd.Series, names: Sequence[Any]) -> pd.Series:
@@ -238,11 +262,24 @@ def _error_and_time(shown: Arranged, subtitle: str) -> Chart | None:
     frame = rows[times == times.groupby([rows[name] for name in pair]).transform("min")]
     looks = method_styles(frame["series"].unique())
     chart = Chart(
-        "speed_accuracy", frame, [SECONDS], [RMSE], "points", series="series", panel="panel", across=2, height=2.2, own_scales=True,
-        title="What error has one estimate, and what time does it take?", subtitle=", ".join(filter(None, [subtitle, FASTEST])),
+        "speed_accuracy",
+        frame,
+        [SECONDS],
+        [RMSE],
+        "points",
+        series="series",
+        panel="panel",
+        across=2,
+        height=2.2,
+        own_scales=True,
+        title="What error has one estimate, and what time does it take?",
+        subtitle=", ".join(filter(None, [subtitle, FASTEST])),
         panel_notes={panel: _summary(law) for panel, law in zip(frame["panel"], frame["contact"], strict=True)},
-        styles={name: replace(look, meaning=f"{short_names(looks, is_whole=True)[name]}: {_family(name.partition('[')[0])}") for name, look in looks.items()},
-    )  # fmt: skip
+        styles={
+            name: replace(look, meaning=f"{short_names(looks, is_whole=True)[name]}: {_family(name.partition('[')[0])}")
+            for name, look in looks.items()
+        },
+    )
     if along is None:
         return chart
     frame = frame.sort_values(along.column, key=lambda at: at == ends[-1], kind="stable")
@@ -252,9 +289,13 @@ def _error_and_time(shown: Arranged, subtitle: str) -> Chart | None:
     moved = ((pairs["cost"].max() - pairs["cost"].min()) / pairs["cost"].mean().abs()).max()
     below = replace(COST, doc=f"costs of the same rollouts, changed by at most {number(100 * moved)}%")
     return replace(
-        chart, name="contrast", frame=frame, y=[replace(RMSE, low="", high=""), *[below] * bool(moved == moved)], arrow="arrow",
+        chart,
+        name="contrast",
+        frame=frame,
+        y=[replace(RMSE, low="", high=""), *[below] * bool(moved == moved)],
+        arrow="arrow",
         arrow_name=f"{along.column} {' to '.join(f'{end:,g}' for end in ends)} {along.unit}".rstrip(),
-    )  # fmt: skip
+    )
 
 
 def _summary(contact: str) -> str:
@@ -275,12 +316,20 @@ def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Cha
     target, backends = TARGETS[0], shown.experiment.compares.get("backends", ())
     lead = best[(best["by"] == "time") & (best["relative error"] == target)].set_index("problem")
     lines: list[dict[str, Any]] = [
-        {"title": problem.title(), "problem": problem.parts()[0], "panel": joined(problem.parts()[1]),
-         "series": name.partition(" on ")[0], "backend": name.partition(" on ")[2], "cost": needed.cost,
-         "sign": "<" * (needed.how == "at once"), "leads": name in (lead["fastest"][problem.title()], *lead["tied"][problem.title()])}
-        for problem in split_by_problem(shown, SAMPLES, ("scene",)) if problem.title() in lead.index
+        {
+            "title": problem.title(),
+            "problem": problem.parts()[0],
+            "panel": joined(problem.parts()[1]),
+            "series": name.partition(" on ")[0],
+            "backend": name.partition(" on ")[2],
+            "cost": needed.cost,
+            "sign": "<" * (needed.how == "at once"),
+            "leads": name in (lead["fastest"][problem.title()], *lead["tied"][problem.title()]),
+        }
+        for problem in split_by_problem(shown, SAMPLES, ("scene",))
+        if problem.title() in lead.index
         for name, needed in methods_by_cost(problem, target, TIME).items()
-    ]  # fmt: skip
+    ]
     if not any(np.isfinite(line["cost"]) for line in lines):
         return None
     frame = pd.DataFrame(lines).sort_values("cost")
@@ -291,12 +340,23 @@ def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Cha
     frame["panel"] = titled(frame, ["backend"] * bool(backends) + ["panel"] * differs)
     grades, looks = graded(factor, BEHIND, "{} times the first".format, "{:g}".format)
     return Chart(
-        "speed_accuracy", frame.assign(grade=grades.mask(frame["leads"], FIRST), cell=frame["sign"] + frame["cost"].map(short_duration)),
-        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", level="grade", cell="cell", across=1,
-        height=0.2, styles={FIRST: Style(GRADES[0.1])} | looks, failed_name="not known to be reached",
+        "speed_accuracy",
+        frame.assign(grade=grades.mask(frame["leads"], FIRST), cell=frame["sign"] + frame["cost"].map(short_duration)),
+        [text("problem", label="")],
+        [ESTIMATOR],
+        "grid",
+        panel="panel",
+        level="grade",
+        cell="cell",
+        across=1,
+        height=0.2,
+        styles={FIRST: Style(GRADES[0.1])} | looks,
+        failed_name="not known to be reached",
         title=f"Which method reaches an error of {target:.0%} first?",
-        subtitle=", ".join(filter(None, [f"time to a relative error of {target:.0%}", subtitle, "" if backends else FASTEST])),
-    )  # fmt: skip
+        subtitle=", ".join(
+            filter(None, [f"time to a relative error of {target:.0%}", subtitle, "" if backends else FASTEST])
+        ),
+    )
 
 
 # --------------------------------------------------------------------------------------------------- estimators
@@ -319,12 +379,34 @@ def _estimators(methods: pd.DataFrame) -> Chart:
     grades, looks = graded(error.map(rounded), GRADES, "error {}".format, "{:g}".format)
     return Chart(
         "estimators",
-        frame.assign(panel=frame["estimator"].map(families), series=frame["estimator"], grade=grades.where(known, "no result"),
-                     cell=(frame["error_is_limit"].map({True: "<"}).fillna("") + error.map(number)).where(known, marks)),
-        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", level="grade", styles=looks | {"no result": Style("#f2f2f2")},
-        cell="cell", across=1, height=0.2, title="Where does each estimator win, and where does it fail?", failed_name="cannot be used",
-        subtitle=", ".join(filter(None, [f"relative RMSE at equal rollouts ({spent})", at_equal, "sorted by the worst case; from 1 on the zero estimate is better"])),
-    )  # fmt: skip
+        frame.assign(
+            panel=frame["estimator"].map(families),
+            series=frame["estimator"],
+            grade=grades.where(known, "no result"),
+            cell=(frame["error_is_limit"].map({True: "<"}).fillna("") + error.map(number)).where(known, marks),
+        ),
+        [text("problem", label="")],
+        [ESTIMATOR],
+        "grid",
+        panel="panel",
+        level="grade",
+        styles=looks | {"no result": Style("#f2f2f2")},
+        cell="cell",
+        across=1,
+        height=0.2,
+        title="Where does each estimator win, and where does it fail?",
+        failed_name="cannot be used",
+        subtitle=", ".join(
+            filter(
+                None,
+                [
+                    f"relative RMSE at equal rollouts ({spent})",
+                    at_equal,
+                    "sorted by the worst case; from 1 on the zero estimate is better",
+                ],
+            )
+        ),
+    )
 
 
 def _family(estimator: str) -> str:

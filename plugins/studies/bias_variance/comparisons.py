@@ -26,8 +26,16 @@ has no number."""
 SAME_COST = 1.05
 """Costs within this factor count as equal: a call at w = 0 that all samples share makes 101 rollouts of 100."""
 LAW = (
-    "bias", "bias_low", "bias_high", "variance", "variance_low", "variance_high", "reference_norm", "reference_se", "rmse_rel",
-)  # fmt: skip
+    "bias",
+    "bias_low",
+    "bias_high",
+    "variance",
+    "variance_low",
+    "variance_high",
+    "reference_norm",
+    "reference_se",
+    "rmse_rel",
+)
 """Columns from which the error at other numbers of samples follows: RMSE^2 = bias^2 + v / N."""
 COLUMNS = (
     text("problem", "what distinguishes the problem from the others"),
@@ -81,16 +89,37 @@ def method_table(shown: Arranged) -> pd.DataFrame:
         error, low, high, is_limit = shown_rmse(rows)
         samples = rows["x"] if along == "samples" else rows["samples"]
         kinds = {name: str(problem.rows[name].iloc[0]).partition("[")[0] for name in CATEGORIES}
-        parts.append(pd.DataFrame({
-            "setting": setting_names(problem, axis, rows), "problem": title, **kinds, "axis": along,
-            "at": rows["x"] if axis else math.nan, "method": rows["method"], "estimator": rows["label"],
-            "error": error, "error_low": low, "error_high": high, "error_is_limit": is_limit,
-            "verdict": verdict(rows["status"], error, low, high, (rows["grad_norm"] == 0) & (rows["variance"] == 0)), "status": rows["status"], "remark": rows["reason"], "trusted": rows.get("trusted", ""),
-            "bias_share": ((rows["bias_low"] / rows["rmse"]) ** 2).where(error > 0),
-            "evaluations": (rows["rollouts"] + rows["gradients"]) / samples, "time_s": rows["seconds"],
-            "rollouts": rows[ROLLOUTS], "has_law": has_law(rows), "has_fixed_work": declares(rows, "fixed_work"),
-            "is_fitted": declares(rows, "couples_samples"), **{name: rows[name] for name in LAW},
-        }))  # fmt: skip
+        parts.append(
+            pd.DataFrame(
+                {
+                    "setting": setting_names(problem, axis, rows),
+                    "problem": title,
+                    **kinds,
+                    "axis": along,
+                    "at": rows["x"] if axis else math.nan,
+                    "method": rows["method"],
+                    "estimator": rows["label"],
+                    "error": error,
+                    "error_low": low,
+                    "error_high": high,
+                    "error_is_limit": is_limit,
+                    "verdict": verdict(
+                        rows["status"], error, low, high, (rows["grad_norm"] == 0) & (rows["variance"] == 0)
+                    ),
+                    "status": rows["status"],
+                    "remark": rows["reason"],
+                    "trusted": rows.get("trusted", ""),
+                    "bias_share": ((rows["bias_low"] / rows["rmse"]) ** 2).where(error > 0),
+                    "evaluations": (rows["rollouts"] + rows["gradients"]) / samples,
+                    "time_s": rows["seconds"],
+                    "rollouts": rows[ROLLOUTS],
+                    "has_law": has_law(rows),
+                    "has_fixed_work": declares(rows, "fixed_work"),
+                    "is_fitted": declares(rows, "couples_samples"),
+                    **{name: rows[name] for name in LAW},
+                }
+            )
+        )
     return pd.concat(parts, ignore_index=True)
 
 

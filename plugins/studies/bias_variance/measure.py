@@ -212,9 +212,12 @@ def summarise_diagnostics(diagnostics: list[Auxiliaries]) -> str:
         if np.isfinite(values).all():
             low, median, high = np.quantile(values, (0.05, 0.5, 0.95)).tolist()
             table[name] = {
-                "mean": float(values.mean()), "low": low, "median": median, "high": high,
+                "mean": float(values.mean()),
+                "low": low,
+                "median": median,
+                "high": high,
                 "zero": float((values == 0).mean()),
-            }  # fmt: skip
+            }
     return json.dumps(table) if table else ""
 
 

@@ -22,8 +22,18 @@ from bench.report.views import Arranged, estimator_curves, shown_rmse
 TIME, ROLLOUTS = "time_s", "rollouts_"
 """Columns with the costs of an estimate: seconds, and rollouts with a gradient at its measured cost."""
 PROGRAM = (
-    "scene", "contact", "integrator", "noise", "horizon", "dt", "stiffness", "sigma", "smoothing", "backend", "dtype",
-)  # fmt: skip
+    "scene",
+    "contact",
+    "integrator",
+    "noise",
+    "horizon",
+    "dt",
+    "stiffness",
+    "sigma",
+    "smoothing",
+    "backend",
+    "dtype",
+)
 
 
 def with_gradient_cost(rows: pd.DataFrame) -> pd.DataFrame:
@@ -236,9 +246,11 @@ def _following(first: str, reached: dict[str, RequiredCost]) -> dict[str, Any]:
     leads = {
         name: lead(reached[first], needed)
         for name, needed in sorted(reached.items(), key=lambda item: order(item[1])[0])
-        if math.isfinite(reached[first].cost) and needed.how != "never" and min(order(needed)[:2]) < math.inf
+        if math.isfinite(reached[first].cost)
+        and needed.how != "never"
+        and min(order(needed)[:2]) < math.inf
         and estimator_of(name) != estimator_of(first)
-    }  # fmt: skip
+    }
     least = {name: low if math.isnan(factor) else factor for name, (factor, low, _) in leads.items()}
     following = min(leads, key=least.__getitem__, default="-")
     factor = ends("factor", leads.get(following, (math.nan,) * 3))
@@ -252,15 +264,28 @@ def accuracy_table(best: pd.DataFrame) -> Table:
         for kind, cost in zip(best["by"], best["cost"], strict=True)
     ]
     columns = [
-        text("problem"), Column("relative error", format="percent"), text("by"), text("fastest"), text("cost_text", label="cost"),
-        Column("samples", format="setting"), text("how"), text("next"),
-        interval("factor", note="factor_note"), text("never"), text("unknown"),
-    ]  # fmt: skip
+        text("problem"),
+        Column("relative error", format="percent"),
+        text("by"),
+        text("fastest"),
+        text("cost_text", label="cost"),
+        Column("samples", format="setting"),
+        text("how"),
+        text("next"),
+        interval("factor", note="factor_note"),
+        text("never"),
+        text("unknown"),
+    ]
     return Table(
-        "time_to_accuracy", best.assign(cost_text=costs, factor_note=limits(best)), columns,
-        "the method that reaches an error at the lowest cost", NOTES, terminal=True, details=("never", "unknown"),
+        "time_to_accuracy",
+        best.assign(cost_text=costs, factor_note=limits(best)),
+        columns,
+        "the method that reaches an error at the lowest cost",
+        NOTES,
+        terminal=True,
+        details=("never", "unknown"),
         data=best.assign(tied=[", ".join(names) for names in best["tied"]]),
-    )  # fmt: skip
+    )
 
 
 def limits(table: pd.DataFrame) -> list[str]:

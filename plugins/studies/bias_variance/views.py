@@ -117,7 +117,8 @@ def tables(
     columns = [replace(c, note="factor_note") if c.name == "factor" else c for c in COMPARED]
     title = "the first and the next at each setting, at equal rollouts"
     return [
-        replace(main, data=axes.table(experiment, rows)), *others,
+        replace(main, data=axes.table(experiment, rows)),
+        *others,
         Table("speed_accuracy", speed_accuracy(rows), [], files=["csv"]),
         *([ranking(methods, equal)] if is_ranked else []),
         recommendations(equal),
@@ -125,7 +126,7 @@ def tables(
         Table("comparisons", joined.assign(factor_note=limits(joined)), columns, title, COMPARISON_NOTES, data=joined),
         *([] if best.empty else [time_to_accuracy.accuracy_table(best)]),
         *descents.tables(shown),
-    ]  # fmt: skip
+    ]
 
 
 COMPARISON_NOTES = (
@@ -155,11 +156,16 @@ def _pivot(axis: Axis | None, problem: ProblemRows, best: Container[tuple[str, s
     error, low, high = (part.where(ok) for part in (error, low, high))
     settings = setting_names(problem, axis, rows)
     is_best = [pair in best for pair in zip(settings, rows["method"], strict=True)]
-    cells = pd.DataFrame({
-        "": error, "_low": low, "_high": high, "_limit": is_limit,
-        "_best": (error < 1) & np.array(is_best, dtype=bool),
-        "_note": note + np.where(rows["reason"] != "", REMARKED, ""),
-    }).set_axis(rows["method"])  # fmt: skip
+    cells = pd.DataFrame(
+        {
+            "": error,
+            "_low": low,
+            "_high": high,
+            "_limit": is_limit,
+            "_best": (error < 1) & np.array(is_best, dtype=bool),
+            "_note": note + np.where(rows["reason"] != "", REMARKED, ""),
+        }
+    ).set_axis(rows["method"])
     values = sorted(rows["x"].unique())
     wide = _across(cells, rows["x"], values, "x").reindex(rows["method"].unique())
     is_swept = axis is not None and axis.column == "samples"
@@ -171,17 +177,25 @@ def _pivot(axis: Axis | None, problem: ProblemRows, best: Container[tuple[str, s
     wide = pd.concat([wide, spent.last() if is_swept else spent.median()], axis=1).copy().rename_axis("method")
     columns = [
         interval(
-            f"x{i}", label=axis_value(x) if axis else "relative RMSE", limit=f"x{i}_limit", emphasis=f"x{i}_best", note=f"x{i}_note",
+            f"x{i}",
+            label=axis_value(x) if axis else "relative RMSE",
+            limit=f"x{i}_limit",
+            emphasis=f"x{i}_best",
+            note=f"x{i}_note",
         )
         for i, x in enumerate(values)
-    ]  # fmt: skip
+    ]
     each = "a sample" if is_swept else "an estimate"
     costs = [Column("rollouts", label=f"rollouts {each}"), Column("time", label=f"time {each}", format="seconds")]
     equal = "" if is_swept or rows["samples"].nunique() > 1 else f", at {axis_value(rows['samples'].iloc[0])} samples"
     return Table(
-        "bias_variance", wide.reset_index(), [ESTIMATOR, *columns, *costs],
-        f"relative RMSE{equal}: {problem.title()}{f', by {axis.title}' if axis else ''}", files=["csv", "md", "tex"], terminal=True,
-    )  # fmt: skip
+        "bias_variance",
+        wide.reset_index(),
+        [ESTIMATOR, *columns, *costs],
+        f"relative RMSE{equal}: {problem.title()}{f', by {axis.title}' if axis else ''}",
+        files=["csv", "md", "tex"],
+        terminal=True,
+    )
 
 
 def _across(cells: pd.DataFrame, place: pd.Series, values: Sequence[Any], prefix: str) -> pd.DataFrame:
@@ -289,12 +303,23 @@ def recommendations(methods: pd.DataFrame) -> Table:
     is_lost = methods.groupby("setting")["failed"].transform("all")
     missing = is_lost.map({True: ("none works",), False: ("none is known to work",)})
     lines = [
-        {"problem": problem, "where": _values(axis, part["at"]), "use": " or ".join(use), "error": _errors(part[part["method"] == use[0]]),
-         "fails": ", ".join(_failing(part)) or "none"}
-        for (problem, axis, use), part in methods.assign(use=use.fillna(missing)).groupby(["problem", "axis", "use"], sort=False)
-    ]  # fmt: skip
+        {
+            "problem": problem,
+            "where": _values(axis, part["at"]),
+            "use": " or ".join(use),
+            "error": _errors(part[part["method"] == use[0]]),
+            "fails": ", ".join(_failing(part)) or "none",
+        }
+        for (problem, axis, use), part in methods.assign(use=use.fillna(missing)).groupby(
+            ["problem", "axis", "use"], sort=False
+        )
+    ]
     columns = [
-        text("problem"), text("where"), text("use"), text("error", label="relative RMSE"), text("fails", label="fails there"),
-    ]  # fmt: skip
+        text("problem"),
+        text("where"),
+        text("use"),
+        text("error", label="relative RMSE"),
+        text("fails", label="fails there"),
+    ]
     notes = ["Errors are compared at equal rollouts, among methods whose interval is below 1."]
     return Table("recommendations", pd.DataFrame(lines), columns, "What to use where", notes, files=(), page=True)

@@ -174,9 +174,15 @@ def under_noise(
 
 
 PER_CHECK = {
-    "point": "place.point", "sample": "place.noise", "direction": "place.number", "contact_switch": "place.switch",
-    "derivative_program": "sample.derivative", "check_verdict": "verdict", "check_error": "error", "check_eps": "eps",
-}  # fmt: skip
+    "point": "place.point",
+    "sample": "place.noise",
+    "direction": "place.number",
+    "contact_switch": "place.switch",
+    "derivative_program": "sample.derivative",
+    "check_verdict": "verdict",
+    "check_error": "error",
+    "check_eps": "eps",
+}
 """What is stored of each check, by column: an attribute of its :class:`Point`."""
 PER_COMPONENT = ("program", "difference", "uncertainty", "step", "ratio", "left", "right", "verdict")
 """What is stored of each checked component."""
@@ -274,9 +280,13 @@ def _settled(problem: Problem, point: Point) -> Point:
         return point
     scale, d = scale_of(problem.program.theta0), place.theta.size
     finding = gradcheck.settle(
-        _cost(problem, d), np.r_[place.theta, place.w], np.r_[scale * place.direction, 0.0 * place.w], scale, point.sample,
+        _cost(problem, d),
+        np.r_[place.theta, place.w],
+        np.r_[scale * place.direction, 0.0 * place.w],
+        scale,
+        point.sample,
         lambda at, vector: tangent(problem, at[:d], vector[:d], at[d:]),
-    )  # fmt: skip
+    )
     return point if finding is None else replace(point, verdict=finding.verdict)
 
 
@@ -344,10 +354,15 @@ def examine(
     )
     slopes = [direction @ gradient for direction, gradient in zip(along.T, problem.grad(thetas, noises).T, strict=True)]
     samples, minus, plus = gradcheck.sampled(
-        _cost(problem, d), np.concatenate([thetas, noises]), np.concatenate([scale * along, 0.0 * noises]),
-        np.full(len(places), scale), np.array(slopes), unit,
-        modes=None if modes is None else lambda at: modes(at[:d], at[d:]), twice=True,
-    )  # fmt: skip
+        _cost(problem, d),
+        np.concatenate([thetas, noises]),
+        np.concatenate([scale * along, 0.0 * noises]),
+        np.full(len(places), scale),
+        np.array(slopes),
+        unit,
+        modes=None if modes is None else lambda at: modes(at[:d], at[d:]),
+        twice=True,
+    )
     parts = zip(places, samples, minus, plus, strict=True)
     return [Point(place, gradcheck.judge(sample).verdict, sample, *sides) for place, sample, *sides in parts]
 

@@ -58,10 +58,15 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     ]
     tables = [
         Table("gradient_verdicts", *_verdicts(points), title="Verdicts", files=[], page=True, terminal=True),
-        Table("gradient_check", *_lines(shown, points), data=long_table(with_axes(experiment.whole_sweep, rows)),
-              title="gradients against differences of the cost", notes=[NOTE, *faults, *reasons(rows)]),
+        Table(
+            "gradient_check",
+            *_lines(shown, points),
+            data=long_table(with_axes(experiment.whole_sweep, rows)),
+            title="gradients against differences of the cost",
+            notes=[NOTE, *faults, *reasons(rows)],
+        ),
         Table("gradient_components", component_table(rows), [], files=["csv"]),
-    ]  # fmt: skip
+    ]
     charts = [] if points.empty else [_grid(points)]
     columns = [experiment.columns.by_name[name] for name in ("verdict", "best_error", "best_eps")]
     switches = dict.fromkeys(f"contact switch: {name}" for names in rows["contact_switch"] for name in _switches(names))
@@ -80,10 +85,12 @@ def headline(rows: pd.DataFrame) -> str:
 def checks(rows: pd.DataFrame) -> pd.DataFrame:
     """Return one line per check with the columns of its row; ``row`` is the position of the row."""
     split = {
-        name: [np.array_split(np.asarray(values, dtype=object), max(len(verdicts), 1))
-               for values, verdicts in zip(rows[name], rows["check_verdict"], strict=True)]
+        name: [
+            np.array_split(np.asarray(values, dtype=object), max(len(verdicts), 1))
+            for values, verdicts in zip(rows[name], rows["check_verdict"], strict=True)
+        ]
         for name in PER_STEP
-    }  # fmt: skip
+    }
     whole = rows.drop(columns="verdict").rename(
         columns={"check_verdict": "verdict", "check_error": "error", "check_eps": "at_eps"}
     )
@@ -168,9 +175,11 @@ def _lines(shown: Arranged, points: pd.DataFrame) -> tuple[pd.DataFrame, list[Co
     line = ["problem", "point", "verdict"]
     frame = points.assign(
         backends=points.groupby(line, sort=False)["backend"].transform(lambda names: ", ".join(dict.fromkeys(names))),
-        switch=[", ".join(_switches(names)) for names in points["contact_switch"].where(points["point"] == "at", math.nan)],
+        switch=[
+            ", ".join(_switches(names)) for names in points["contact_switch"].where(points["point"] == "at", math.nan)
+        ],
         place=points["point"].map(POINTS.index),
-    )  # fmt: skip
+    )
     frame = frame.sort_values("error", ascending=False, kind="stable").drop_duplicates(line)
     frame = frame.sort_values(["problem", "place", "rank"], kind="stable")
     heads = [COMMON.get(name, Column(name, format="setting")) for name in labels]
@@ -180,14 +189,23 @@ def _lines(shown: Arranged, points: pd.DataFrame) -> tuple[pd.DataFrame, list[Co
 def _verdicts(points: pd.DataFrame) -> tuple[pd.DataFrame, list[Column]]:
     """Return a line per verdict: its meaning, the number of points, the largest error and the scenes; and the columns."""
     lines = [
-        {"verdict": verdict, "meaning": RULES[verdict].meaning, "trusted": _trusted(verdict, part),
-         "points": len(part), "error": part["error"].max(), "scenes": ", ".join(dict.fromkeys(part["scene"]))}
-        for verdict in VERDICTS if len(part := points[points["verdict"] == verdict])
-    ]  # fmt: skip
+        {
+            "verdict": verdict,
+            "meaning": RULES[verdict].meaning,
+            "trusted": _trusted(verdict, part),
+            "points": len(part),
+            "error": part["error"].max(),
+            "scenes": ", ".join(dict.fromkeys(part["scene"])),
+        }
+        for verdict in VERDICTS
+        if len(part := points[points["verdict"] == verdict])
+    ]
     columns = [
-        *map(text, ("verdict", "meaning", "trusted")), Column("points", format="setting"),
-        Column("error", label="largest error"), text("scenes"),
-    ]  # fmt: skip
+        *map(text, ("verdict", "meaning", "trusted")),
+        Column("points", format="setting"),
+        Column("error", label="largest error"),
+        text("scenes"),
+    ]
     return pd.DataFrame(lines, columns=[column.name for column in columns]), columns
 
 
@@ -205,10 +223,12 @@ def _grid(points: pd.DataFrame) -> Chart:
     letters = {verdict: letter for letter, (verdicts, _) in KINDS.items() for verdict in verdicts}
     names = {name: place for place, name in enumerate(dict.fromkeys(points["name"]))}
     frame = points.assign(
-        letter=points["verdict"].map(letters), place=points["point"].map(POINTS.index), order=points["name"].map(names),
+        letter=points["verdict"].map(letters),
+        place=points["point"].map(POINTS.index),
+        order=points["name"].map(names),
         point=points["point"].map(PLACES),
         steps=[counted(int(horizon), "step") if horizon > 0 else "no steps" for horizon in points["horizon"]],
-    ).sort_values(["rank", "error"], ascending=[True, False], kind="stable")  # fmt: skip
+    ).sort_values(["rank", "error"], ascending=[True, False], kind="stable")
     frame = frame.drop_duplicates(["name", "horizon", "point"]).sort_values(
         ["horizon", "place", "order"], kind="stable"
     )
@@ -217,8 +237,16 @@ def _grid(points: pd.DataFrame) -> Chart:
             ["order", "place"], kind="stable"
         )
     return Chart(
-        "gradient_check", frame, [text("point", label="")], [text("name", label="")], "grid",
-        panel="steps", level="letter", cell="letter", styles={letter: style for letter, (_, style) in KINDS.items()},
-        height=0.17, failed_name="no switch of contact, or no fault under noise, was found",
+        "gradient_check",
+        frame,
+        [text("point", label="")],
+        [text("name", label="")],
+        "grid",
+        panel="steps",
+        level="letter",
+        cell="letter",
+        styles={letter: style for letter, (_, style) in KINDS.items()},
+        height=0.17,
+        failed_name="no switch of contact, or no fault under noise, was found",
         text="The worst verdict over backends and checks.",
-    )  # fmt: skip
+    )

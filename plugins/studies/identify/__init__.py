@@ -25,43 +25,75 @@ class Identify(StudyPackage):
     columns = Columns.of(
         text("optimizer", "identity string of the optimizer"),
         Column("rank", "directions of the parameters that the record sees"),
-        exact("condition", "largest singular value of the information over the smallest that is seen", "condition number"),
+        exact(
+            "condition", "largest singular value of the information over the smallest that is seen", "condition number"
+        ),
         Column("fits", "records that were fitted"),
         Column("step_shift", "largest relative change of an estimate when the model's step is halved, without noise"),
         Column("step_shift_bound", "the same in units of the Cramer-Rao bound"),
-        Column("explained", "share of records that no test of the residuals contradicts, at 5% false alarms",
-               label="explained", format="percent"),
+        Column(
+            "explained",
+            "share of records that no test of the residuals contradicts, at 5% false alarms",
+            label="explained",
+            format="percent",
+        ),
         text("contradictions", "tests that the first record's fit fails, each with its statistic in units of its edge"),
         Column("noise_size", "standard deviation of the residuals of the first record", "m"),
-        text("interval_noise", "noise that the first record's intervals allow for: of stated size, own size (that of the residuals), or "
-             "correlated; empty: not all products are identifiable"),
-        numbers("parameter", "identifiable products of powers of the unknowns, then unknowns that are not identifiable"),
+        text(
+            "interval_noise",
+            "noise that the first record's intervals allow for: of stated size, own size (that of the residuals), or "
+            "correlated; empty: not all products are identifiable",
+        ),
+        numbers(
+            "parameter", "identifiable products of powers of the unknowns, then unknowns that are not identifiable"
+        ),
         numbers("estimate", "estimate of the first record by single shooting; nan: not identifiable", digits=4),
         *(numbers(f"estimate_{end}", f"{end} end of its 95% interval", digits=4, label=end) for end in ("low", "high")),
         numbers("unit", "its unit"),
         numbers("start", "value where its fit starts", format="setting"),
         numbers("identifiable", "yes, product (in products only), or no", label="seen"),
         numbers("bias", "the largest bias that a missing term causes while 5% of records do not show it"),
-        numbers("biased", "identifiable products, each with every term that the model lacks and whose effect is tested", label="parameter"),
+        numbers(
+            "biased",
+            "identifiable products, each with every term that the model lacks and whose effect is tested",
+            label="parameter",
+        ),
         numbers("term", "the term"),
         numbers("unnoticed", "the largest bias that it causes while 5% of records do not show it", label="unseen bias"),
         numbers("errors", "this bias in standard errors", label="in standard errors"),
-        *several(numbers, {
-            "unknowns": "names of the parameters",
-            "truth": "true values of the parameters; nan: a record of your own",
-            "invariants": "identifiable products of powers of the parameters",
-            "bound": "Cramer-Rao bound of the relative standard deviation of each invariant",
-            "shooting": "the shooting methods: single, multiple, windows",
-            "optimum": "by shooting method, share of fits whose optimizer has reached an optimum",
-        }),
-        *bounded("converged", "by shooting method, share of fits whose residuals are consistent with the noise", kind=numbers,
-                 label="share of fits that converge"),
-        numbers("error", "by shooting method, root mean square error of converged fits in units of the bound",
-                label="error / Cramer-Rao bound", low="error_low", high="error_high"),
-        *bounded("coverage", "by shooting method, share of 95% intervals of converged fits that contain the truth", kind=numbers,
-                 of="its 95% interval over records", label="coverage of 95% intervals"),
+        *several(
+            numbers,
+            {
+                "unknowns": "names of the parameters",
+                "truth": "true values of the parameters; nan: a record of your own",
+                "invariants": "identifiable products of powers of the parameters",
+                "bound": "Cramer-Rao bound of the relative standard deviation of each invariant",
+                "shooting": "the shooting methods: single, multiple, windows",
+                "optimum": "by shooting method, share of fits whose optimizer has reached an optimum",
+            },
+        ),
+        *bounded(
+            "converged",
+            "by shooting method, share of fits whose residuals are consistent with the noise",
+            kind=numbers,
+            label="share of fits that converge",
+        ),
+        numbers(
+            "error",
+            "by shooting method, root mean square error of converged fits in units of the bound",
+            label="error / Cramer-Rao bound",
+            low="error_low",
+            high="error_high",
+        ),
+        *bounded(
+            "coverage",
+            "by shooting method, share of 95% intervals of converged fits that contain the truth",
+            kind=numbers,
+            of="its 95% interval over records",
+            label="coverage of 95% intervals",
+        ),
         numbers("hidden", "by shooting method, fits with more identifiable directions than the record has"),
-    )  # fmt: skip
+    )
 
     revision = 3
 

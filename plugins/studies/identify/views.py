@@ -17,8 +17,15 @@ from bench.experiment.views import Chart, Mark, Table, Views
 from bench.report.shown import Shown, stacked
 
 STATISTICS = (
-    "converged", "converged_low", "converged_high", "error", "coverage", "coverage_low", "coverage_high", "hidden",
-)  # fmt: skip
+    "converged",
+    "converged_low",
+    "converged_high",
+    "error",
+    "coverage",
+    "coverage_low",
+    "coverage_high",
+    "hidden",
+)
 """Columns with one value per shooting method."""
 LEVEL, CONVERGED = 0.95, 0.9
 """Stated coverage of the intervals, and the least share of fits that have to converge."""
@@ -63,13 +70,18 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     # rows of older versions lack the columns
     given = given[given["parameter"].map(np.ndim) > 0]
     doubts = {
-        "unfinished": [values[0] < 1.0 for values in given["optimum"]], "not explained": given["contradictions"] != "",
-        "untested": given["explained"].isna(), "time step": given["step_shift_bound"] > MAX_STEP_SHIFT,
-    }  # fmt: skip
+        "unfinished": [values[0] < 1.0 for values in given["optimum"]],
+        "not explained": given["contradictions"] != "",
+        "untested": given["explained"].isna(),
+        "time step": given["step_shift_bound"] > MAX_STEP_SHIFT,
+    }
     given = given.assign(
         problem=given["problem"] + (", " + given["optimizer"] if given["optimizer"].nunique() > 1 else ""),
-        doubt=[", ".join(name for name, holds in zip(doubts, row, strict=True) if holds) for row in zip(*doubts.values(), strict=True)],
-    )  # fmt: skip
+        doubt=[
+            ", ".join(name for name, holds in zip(doubts, row, strict=True) if holds)
+            for row in zip(*doubts.values(), strict=True)
+        ],
+    )
     kinds: dict[str, Any] = {"list": "number"} | dict.fromkeys(TEXTS, "text")
     by_name = {c.name: replace(c, kind=kinds.get(c.name, kinds.get(c.kind, c.kind))) for c in experiment.columns.all}
     by_name |= {name: text(name) for name in ("problem", "doubt", "verdict")}
@@ -82,26 +94,57 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     split = "problem" if len(given) > 1 else ""
     tables = [
         Table(
-            "identify", found,
+            "identify",
+            found,
             columns(*ESTIMATED[:5], *["doubt"] * bool(found["doubt"].any()), *ESTIMATED[5:]),
-            "Estimates", ESTIMATES, terminal=True, page=True, split=split, data=table(experiment, rows),
+            "Estimates",
+            ESTIMATES,
+            terminal=True,
+            page=True,
+            split=split,
+            data=table(experiment, rows),
         ),
         Table(
-            "identify", hidden[hidden["errors"] > 1.0], columns(*BIASED),
-            "What a record cannot show", UNNOTICED, terminal=not split, page=True, split=split,
+            "identify",
+            hidden[hidden["errors"] > 1.0],
+            columns(*BIASED),
+            "What a record cannot show",
+            UNNOTICED,
+            terminal=not split,
+            page=True,
+            split=split,
         ),
         Table(
-            "identify", given,
-            columns("problem", "explained", "contradictions", "interval_noise", "noise_size", "step_shift_bound", "condition"),
-            "Records", RECORDS, terminal=True, page=True,
+            "identify",
+            given,
+            columns(
+                "problem",
+                "explained",
+                "contradictions",
+                "interval_noise",
+                "noise_size",
+                "step_shift_bound",
+                "condition",
+            ),
+            "Records",
+            RECORDS,
+            terminal=True,
+            page=True,
         ),
         Table(
-            "identify", lines,
+            "identify",
+            lines,
             columns("problem", "shooting", "verdict", "converged", "error", "coverage", "hidden", "fits"),
-            "Fits", NOTES, terminal=True, page=True,
+            "Fits",
+            NOTES,
+            terminal=True,
+            page=True,
         ),
-        *(Table(name, frame, [], files=["csv"]) for name, frame in (("estimates", found), ("unnoticed", hidden), ("fits", lines))),
-    ]  # fmt: skip
+        *(
+            Table(name, frame, [], files=["csv"])
+            for name, frame in (("estimates", found), ("unnoticed", hidden), ("fits", lines))
+        ),
+    ]
     if lines.empty:
         return Views(tables[:1])
     return Views(tables, charts(lines, columns("error", "coverage")))
@@ -156,8 +199,18 @@ def charts(lines: pd.DataFrame, fits: Sequence[Column]) -> list[Chart]:
     frame = frame.assign(failed=(frame["converged"] == 0) & (frame["series"] == fits[0].heading))
     return [
         Chart(
-            "identify", frame, [interval("value", label=" ")],
-            [text("problem", label="")], "dots", series="shooting", panel="series", marks=marks, failed="failed",
-            failed_name="no fit converges", own_scales=True, across=2, height=0.34,
+            "identify",
+            frame,
+            [interval("value", label=" ")],
+            [text("problem", label="")],
+            "dots",
+            series="shooting",
+            panel="series",
+            marks=marks,
+            failed="failed",
+            failed_name="no fit converges",
+            own_scales=True,
+            across=2,
+            height=0.34,
         )
-    ]  # fmt: skip
+    ]

@@ -54,8 +54,11 @@ class Optimise(SearchStudy):
         *(ESTIMATES.by_name[name] for name in ("reference_method", "reference_spacing")),
         text("optimizer", "identity string of the optimizer"),
         text("stopped", "reason for the end of the search: budget or diverged"),
-        text("scene_class", "smooth, stiff (contact), chaotic (gradients vary more than costs), discontinuous or identification",
-             label="class"),
+        text(
+            "scene_class",
+            "smooth, stiff (contact), chaotic (gradients vary more than costs), discontinuous or identification",
+            label="class",
+        ),
         Column("iterations", "steps of the optimizer"),
         Column("rollouts", "rollouts of the search, without those that score its path"),
         Column("gradients", "gradients of the search"),
@@ -67,19 +70,26 @@ class Optimise(SearchStudy):
         Column("optimum", "least known cost J*, from before the search"),
         text("optimum_status", "source of J*"),
         Column("score", "share of the way from the start to J*, between 0 and 1; empty without J*"),
-        Column("quality_rmse_rel", "relative root mean squared error of the estimator's gradients at the start",
-               label="gradient's error, relative"),
+        Column(
+            "quality_rmse_rel",
+            "relative root mean squared error of the estimator's gradients at the start",
+            label="gradient's error, relative",
+        ),
         Column("quality_cosine", "mean cosine between those gradients and the reference"),
         Column("quality_bias_share", "share of bias in the squared error of those gradients", label="share of bias"),
-        *several(numbers, {
-            "path_iteration": "iterations at which the path is recorded",
-            "path_cost": "objective at those iterations",
-            "path_rollouts": "rollouts up to those iterations",
-            "path_gradients": "gradients up to those iterations",
-        }, table=False),
+        *several(
+            numbers,
+            {
+                "path_iteration": "iterations at which the path is recorded",
+                "path_cost": "objective at those iterations",
+                "path_rollouts": "rollouts up to those iterations",
+                "path_gradients": "gradients up to those iterations",
+            },
+            table=False,
+        ),
         numbers("path_s", "time up to those iterations", "s", table=False, measured=True),
         numbers("theta", "the last theta", table=False),
-    )  # fmt: skip
+    )
 
     budget: int = param(20_000, "rollouts that a search may spend, a gradient counting as gradient_cost", positive=True)
     gradient_cost: float = param(4.0, "rollouts that a gradient counts as in the budget", positive=True)

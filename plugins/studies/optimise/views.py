@@ -43,9 +43,12 @@ BETTER = interval("improvement", label="beats fobg")
 PROFILE = Column("profile", log=False)
 MEDIAN = Column("median_score", label="median over tunings", log=False)
 RUNTIME = interval(
-    "art", label="average runtime", unit="rollouts", log=True,
+    "art",
+    label="average runtime",
+    unit="rollouts",
+    log=True,
     doc="expected rollouts per target reached: all rollouts of all searches over the searches that reached it",
-)  # fmt: skip
+)
 RATE = interval("rate", label="searches that reach it")
 SPENT = Column("spent", label="rollouts", log=True)
 NOTE = (
@@ -59,9 +62,17 @@ NOTE = (
     "an estimator (dashed in charts) are context."
 )
 PAGE = (
-    "stopped", "scene_class", "final_cost", "best_known", "score", "rollouts", "gradients", "search_s", "quality_rmse_rel",
+    "stopped",
+    "scene_class",
+    "final_cost",
+    "best_known",
+    "score",
+    "rollouts",
+    "gradients",
+    "search_s",
+    "quality_rmse_rel",
     "quality_bias_share",
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,11 +185,20 @@ def times_to_targets(runs: RunSet) -> pd.DataFrame:
     lines = []
     for (problem, method, target), part in hits(runs).groupby(["problem", "method", "target"], sort=False):
         costs, reached = part["spent"].to_numpy(), part["reached"].to_numpy()
-        lines.append({
-            "problem": problem, "method": method, "tuning": runs.best_tunings[problem, method], "target": target,
-            "successes": int(reached.sum()), "searches": len(reached), **ends("rate", (float(reached.mean()), *performance.wilson(int(reached.sum()), len(reached)))),
-            **ends("art", (performance.average_runtime(costs, reached), *performance.runtime_interval(costs, reached))),
-        })  # fmt: skip
+        lines.append(
+            {
+                "problem": problem,
+                "method": method,
+                "tuning": runs.best_tunings[problem, method],
+                "target": target,
+                "successes": int(reached.sum()),
+                "searches": len(reached),
+                **ends("rate", (float(reached.mean()), *performance.wilson(int(reached.sum()), len(reached)))),
+                **ends(
+                    "art", (performance.average_runtime(costs, reached), *performance.runtime_interval(costs, reached))
+                ),
+            }
+        )
     return pd.DataFrame(lines)
 
 
@@ -218,13 +238,21 @@ def summarise(runs: RunSet) -> pd.DataFrame:
         share, error = share_of_targets(own)
         low, high = over_scenes(runs, own.groupby("problem")["rate"].mean(), share - error, share + error)
         cells = runs.rows[runs.rows["method"] == method]
-        lines.append({
-            "method": method, "problems": part["problem"].nunique(), "searches": len(part),
-            **ends("reached", (share, max(0.0, low), min(1.0, high))),
-            "verdict": "first or tied" if method in tied else "",
-            **ends("score", _score(runs, part.dropna(subset="score"))), **better.loc[method], "profile": profiles[method], "diverged": int((part["status"] == "diverged").sum()),
-            "tunings": int(cells["tuning"].nunique()), "median_score": float(cells["score"].median()),
-        })  # fmt: skip
+        lines.append(
+            {
+                "method": method,
+                "problems": part["problem"].nunique(),
+                "searches": len(part),
+                **ends("reached", (share, max(0.0, low), min(1.0, high))),
+                "verdict": "first or tied" if method in tied else "",
+                **ends("score", _score(runs, part.dropna(subset="score"))),
+                **better.loc[method],
+                "profile": profiles[method],
+                "diverged": int((part["status"] == "diverged").sum()),
+                "tunings": int(cells["tuning"].nunique()),
+                "median_score": float(cells["score"].median()),
+            }
+        )
     return pd.DataFrame(lines)
 
 
@@ -296,9 +324,11 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
     cells = cells.fillna({"problem": "", "method": "", "tuning": ""}).astype({"score": float, "best_known": float})
     by_name = experiment.columns.by_name | {"best_known": Column("best_known", label="J*")}
     return Views(
-        tables(experiment, rows, runs), charts(runs), rows=cells,
+        tables(experiment, rows, runs),
+        charts(runs),
+        rows=cells,
         columns=[METHOD, *(by_name[column] for column in PAGE)],
-    )  # fmt: skip
+    )
 
 
 # --------------------------------------------------------------------------------------------------------- tables
@@ -312,25 +342,47 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet) -> list[Tab
     seeds = f"seeds {', '.join(map(str, chosen))}, which do not score" if chosen else "the same seeds that score"
     return [
         Table(
-            "optimise", methods,
-            [METHOD, REACHED, text("verdict"), SCORE, BETTER, PROFILE, *(Column(name, format="setting") for name in ("tunings", "searches", "diverged")), MEDIAN],
-            "methods by the share of targets they reach", [NOTE.format(seeds=seeds)], terminal=True, page=True,
+            "optimise",
+            methods,
+            [
+                METHOD,
+                REACHED,
+                text("verdict"),
+                SCORE,
+                BETTER,
+                PROFILE,
+                *(Column(name, format="setting") for name in ("tunings", "searches", "diverged")),
+                MEDIAN,
+            ],
+            "methods by the share of targets they reach",
+            [NOTE.format(seeds=seeds)],
+            terminal=True,
+            page=True,
             data=table(experiment, rows),
         ),
         Table(
-            "optimise", reached.assign(regret=[f"1/{t:g}" for t in reached["target"]]),
-            [PROBLEM, METHOD, text("tuning"), text("regret"), RATE, RUNTIME], "Times to targets",
+            "optimise",
+            reached.assign(regret=[f"1/{t:g}" for t in reached["target"]]),
+            [PROBLEM, METHOD, text("tuning"), text("regret"), RATE, RUNTIME],
+            "Times to targets",
             terminal=True,
         ),
         Table(
-            "optimise", runs.rows.drop_duplicates("problem"),
-            [PROBLEM, text("scene_class", label="class"), Column("start_cost", label="J0", digits=6),
-             Column("best_known", label="J*", digits=8), text("best_known_status", label="source of J*")],
-            "Lowest costs", terminal=True,
+            "optimise",
+            runs.rows.drop_duplicates("problem"),
+            [
+                PROBLEM,
+                text("scene_class", label="class"),
+                Column("start_cost", label="J0", digits=6),
+                Column("best_known", label="J*", digits=8),
+                text("best_known_status", label="source of J*"),
+            ],
+            "Lowest costs",
+            terminal=True,
         ),
         Table("targets", reached, [], files=["csv"]),
         Table("summary", summary, [], files=["csv"]),
-    ]  # fmt: skip
+    ]
 
 
 # --------------------------------------------------------------------------------------------------------- charts
@@ -342,10 +394,17 @@ def charts(runs: RunSet) -> list[Chart]:
     where = f"{len(problems)} problems" if len(problems) > 1 else problems[0]
     looks = method_styles(runs.rows["method"].unique())
     targets = Chart(
-        "targets", summarise(runs).sort_values("reached", ascending=False, kind="stable"), [REACHED], [METHOD], "dots",
-        series="method", styles=looks, height=0.24, title="Which method reaches most targets?",
+        "targets",
+        summarise(runs).sort_values("reached", ascending=False, kind="stable"),
+        [REACHED],
+        [METHOD],
+        "dots",
+        series="method",
+        styles=looks,
+        height=0.24,
+        title="Which method reaches most targets?",
         subtitle=f"{where}, targets: a tenth, a hundredth and a thousandth of the first regret",
-    )  # fmt: skip
+    )
     # the weights of a method's searches add up to 1, in equal parts for its problems and targets
     weight = 1.0 / times.groupby(["problem", "method", "target"])["spent"].transform("size")
     weight = (weight / weight.groupby(times["method"]).transform("sum")).where(times["reached"], 0.0)
@@ -353,9 +412,16 @@ def charts(runs: RunSet) -> list[Chart]:
     frame = frame.assign(share=frame.groupby("method")["share"].cumsum())
     share = Column("share", label="share of targets reached", format="percent", log=False)
     runtimes = Chart(
-        "runtimes", frame, [SPENT], [share], series="method", styles=looks, height=2.6, steps=True,
+        "runtimes",
+        frame,
+        [SPENT],
+        [share],
+        series="method",
+        styles=looks,
+        height=2.6,
+        steps=True,
         title="In how many rollouts does each method reach its targets?",
         subtitle=f"{where}, single searches, a gradient counts as its time in rollouts",
         text="Where a line ends is the share of targets reached in the whole budget.",
-    )  # fmt: skip
+    )
     return [targets, runtimes]

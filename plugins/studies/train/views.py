@@ -31,24 +31,37 @@ OF_WINDOWS = ("window_bias", "window_bias_low", "window_bias_high", "window_grad
 PROBLEM, METHOD, VERDICT = text("problem"), text("method", label="trainer"), text("verdict")
 FINAL = interval("final", label="final return", digits=3, log=False)
 SUMMARY = (
-    PROBLEM, METHOD, FINAL, VERDICT, Column("settings", format="setting"),
+    PROBLEM,
+    METHOD,
+    FINAL,
+    VERDICT,
+    Column("settings", format="setting"),
     Column("tuned", label="at the choosing seeds", digits=3, log=False),
-    Column("worst", label="worst seed", digits=3), Column("seeds", format="setting"),
-    Column("failed", label="not finite", format="setting"), Column("steps", unit="steps", label="control steps", digits=3),
+    Column("worst", label="worst seed", digits=3),
+    Column("seeds", format="setting"),
+    Column("failed", label="not finite", format="setting"),
+    Column("steps", unit="steps", label="control steps", digits=3),
     Column("used", label="used steps", digits=3),
     interval("equal", label="at equal used steps", digits=3, log=False),
-    Column("train_s", label="training", format="seconds"), Column("compile_s", label="compilation", format="seconds"),
-    Column("gradient_typical", label="gradient norm"), Column("gradient_peak", label="largest gradient"),
+    Column("train_s", label="training", format="seconds"),
+    Column("compile_s", label="compilation", format="seconds"),
+    Column("gradient_typical", label="gradient norm"),
+    Column("gradient_peak", label="largest gradient"),
     Column("cosine", label="cosine"),
-)  # fmt: skip
+)
 WINDOW = Column("window", label="window", unit="steps", format="setting")
 WINDOW_GRADIENT = Column("window_gradient", label="norm of the windows' gradient")
 WINDOW_BIAS = interval("window_bias", label="bias of the windows' gradient")
 WINDOWS = (
-    PROBLEM, text("family", label="trainer"), WINDOW,
-    WINDOW_GRADIENT, replace(WINDOW_BIAS, label="its bias"),
-    Column("gradient_typical", label="gradient norm in training"), FINAL, VERDICT,
-)  # fmt: skip
+    PROBLEM,
+    text("family", label="trainer"),
+    WINDOW,
+    WINDOW_GRADIENT,
+    replace(WINDOW_BIAS, label="its bias"),
+    Column("gradient_typical", label="gradient norm in training"),
+    FINAL,
+    VERDICT,
+)
 FAULTS = (
     PROBLEM,
     METHOD,
@@ -87,8 +100,19 @@ VERDICTS = (
 WINDOW_VERDICTS = (
     "verdict: first, tied (not distinguishable), behind (by a Mann-Whitney test at 5%), or open where none is behind."
 )
-PAGE = ("final_return", "first_return", "final_median", "updates", "steps", "train_s", "compile_s", "gradient_typical",
-        "gradient_peak", "window_gradient", "window_bias")  # fmt: skip
+PAGE = (
+    "final_return",
+    "first_return",
+    "final_median",
+    "updates",
+    "steps",
+    "train_s",
+    "compile_s",
+    "gradient_typical",
+    "gradient_peak",
+    "window_gradient",
+    "window_bias",
+)
 
 
 def runs_of(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
@@ -140,16 +164,26 @@ def summarise(runs: pd.DataFrame, by: Sequence[str] = ("problem", "method")) -> 
     for key, part in at_equal_steps(runs).groupby(list(by), sort=False):
         final, equal = final_returns(part), final_returns(part, "equal")
         cosines = np.concatenate([np.asarray(c, float) for c in part["cosine"]])
-        lines.append(dict(zip(by, key, strict=True)) | {
-            "family": part["family"].iloc[0], "seeds": len(part),
-            "failed": int((part["status"] != "ok").sum()), "returns": final, **middle_with_interval("final", final), "worst": float(final.min()), "steps": float(part["steps"].max()), "used": float(part["used"].median()),
-            **middle_with_interval("equal", equal),
-            "train_s": float(part["train_s"].median()), "compile_s": float(part["compile_s"].max()),
-            "gradient_typical": float(part["gradient_typical"].median()),
-            "gradient_peak": float(part["gradient_peak"].max()),
-            "cosine": float(np.nanmean(cosines)) if np.isfinite(cosines).any() else math.nan,
-            **part[[*OF_WINDOWS]].median(),
-        })  # fmt: skip
+        lines.append(
+            dict(zip(by, key, strict=True))
+            | {
+                "family": part["family"].iloc[0],
+                "seeds": len(part),
+                "failed": int((part["status"] != "ok").sum()),
+                "returns": final,
+                **middle_with_interval("final", final),
+                "worst": float(final.min()),
+                "steps": float(part["steps"].max()),
+                "used": float(part["used"].median()),
+                **middle_with_interval("equal", equal),
+                "train_s": float(part["train_s"].median()),
+                "compile_s": float(part["compile_s"].max()),
+                "gradient_typical": float(part["gradient_typical"].median()),
+                "gradient_peak": float(part["gradient_peak"].max()),
+                "cosine": float(np.nanmean(cosines)) if np.isfinite(cosines).any() else math.nan,
+                **part[[*OF_WINDOWS]].median(),
+            }
+        )
     frame = pd.DataFrame(lines)
     return frame.sort_values(["problem", "final"], ascending=[True, False], kind="stable").reset_index(drop=True)
 
@@ -283,31 +317,55 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
     chosen = summary[~summary["verdict"].isin(["not chosen", "not run"])].set_index(["problem", "method"]).index
     shown = reported[pd.MultiIndex.from_frame(reported[["problem", "method"]]).isin(chosen)]
     tables = [
-        Table("train", summary, SUMMARY, "final return by trainer", [NOTE, VERDICTS], terminal=True, page=True, data=table(experiment, rows),
-              details=["compile_s", "gradient_typical", "gradient_peak"]),
+        Table(
+            "train",
+            summary,
+            SUMMARY,
+            "final return by trainer",
+            [NOTE, VERDICTS],
+            terminal=True,
+            page=True,
+            data=table(experiment, rows),
+            details=["compile_s", "gradient_typical", "gradient_peak"],
+        ),
         Table("summary", summary, [], files=["csv"]),
-    ]  # fmt: skip
+    ]
     if len(windows):
         verdicts = ranked(windows.assign(tuned=0.0), ["problem", "family"], "window")
         lines = windows.assign(verdict=verdicts).drop(columns=["returns", "failed"])
-        tables.append(Table("windows", lines, WINDOWS, "Windows", [WINDOW_NOTE, WINDOW_VERDICTS], terminal=True, page=True,
-                            details=["gradient_typical"]))  # fmt: skip
+        tables.append(
+            Table(
+                "windows",
+                lines,
+                WINDOWS,
+                "Windows",
+                [WINDOW_NOTE, WINDOW_VERDICTS],
+                terminal=True,
+                page=True,
+                details=["gradient_typical"],
+            )
+        )
     if len(faults):
         notes = [FAULT_NOTE, *(f"- {code}: {RULES[code][1]}" for code in faults["code"].unique())]
         tables.append(Table("faults", faults, FAULTS, "Faults in the logs", notes, page=True))
     cells = rows.assign(problem=runs["problem"], method=runs["method"]).fillna({"problem": "", "method": ""})
     by_name = experiment.columns.by_name
-    return Views(tables, _charts(shown, windows), cells,
-                 [METHOD, *(by_name[name] for name in PAGE)])  # fmt: skip
+    return Views(tables, _charts(shown, windows), cells, [METHOD, *(by_name[name] for name in PAGE)])
 
 
 def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
     frame = curves_of(runs)
     cost = replace(COST, log=bool((frame["cost"] > 0).all()))
     curves = Chart(
-        "train", frame.dropna(subset=["step"]), [STEP], [cost], series="method", panel="problem", band=True,
+        "train",
+        frame.dropna(subset=["step"]),
+        [STEP],
+        [cost],
+        series="method",
+        panel="problem",
+        band=True,
         subtitle=MIDDLES,
-    )  # fmt: skip
+    )
     times = replace(
         curves,
         name="times",
@@ -317,7 +375,13 @@ def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
     )
     final = windows.assign(cost=-windows["final"], cost_low=-windows["final_high"], cost_high=-windows["final_low"])
     lengths = Chart(
-        "windows", final, [replace(WINDOW, log=True)], [cost], series="family", panel="problem",
-        title="What does the length of a window do?", subtitle=f"after training; {MIDDLES}",
-    )  # fmt: skip
+        "windows",
+        final,
+        [replace(WINDOW, log=True)],
+        [cost],
+        series="family",
+        panel="problem",
+        title="What does the length of a window do?",
+        subtitle=f"after training; {MIDDLES}",
+    )
     return [replace(one, styles=method_styles(one.frame[one.series].unique())) for one in (curves, times, lengths)]
