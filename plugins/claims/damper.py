@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from bench.claims import Claim, Figure, Outcome
@@ -25,7 +27,7 @@ class Damper(Claim):
     lesson = "Stiffness or step size"
     statement = (
         "With a damper of a thousandth of the stiffness, the means of first and zeroth order differ by 3.39 at 1e4 N/m and by "
-        "78.4 at 2e5. Without a damper they agree, and a step ten times finer changes nothing: the damper jumps at first touch."
+        "78.4 at 2e5. Without a damper they agree, and at 1e4 a step ten times finer changes nothing: the damper jumps at first touch."
     )
     source = "Zhong, Han, Brikis 2022, task 2; distances by an independent program"
     origin = "recomputed"
@@ -36,7 +38,7 @@ class Damper(Claim):
 
     def measure(self) -> Outcome:
         """Estimate both means with the same samples."""
-        figures, series = [], {"stiffness k [N/m]": STIFFNESSES}
+        figures, series = [], dict[str, Any]({"stiffness k [N/m]": STIFFNESSES})
         for steps, published in DISTANCES.items():
             series[f"damper of k / 1000, {steps} steps"] = found = [_distance(k, steps) for k in STIFFNESSES]
             figures += [

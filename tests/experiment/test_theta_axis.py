@@ -23,8 +23,8 @@ def test_whole_thetas_are_an_axis_whose_columns_are_the_coordinates_that_move():
     assert len({cell.key for cell in of}) == 2
     rows = rows_of(experiment, of)
     assert [axis.title for axis in axes(experiment.sweep, rows)] == [
-        "theta0.0, with theta0.4",
-        "theta0.4, with theta0.0",
+        "theta0.0, and with it theta0.4",
+        "theta0.4, and with it theta0.0",
     ]
     assert with_axes(experiment.sweep, rows)["theta0.4"].tolist() == [2.0, 4.0]
 
