@@ -497,7 +497,7 @@ def charts(cells: pd.DataFrame, limit: float) -> list[Chart]:
                 limit_name=LIMIT,
                 height=0.16,
                 subtitle=f"{name}. Number: error of the gradient, in % of the true one. Near 0: gradient and error are below {100 * limit:g}% "
-                "of the scene's largest gradient",
+                "of the scene's largest gradient. Beside the limit a small error may be a coincidence of the phase",
                 text="The worst where backends disagree. Of several contact laws, each is drawn with the integrator that is most often right.",
             )
         )
