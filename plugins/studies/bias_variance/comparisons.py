@@ -14,11 +14,10 @@ import pandas as pd
 from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, interval, text
 from bench.measure import statistics
-from bench.model import registry
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.views import CATEGORIES, Arranged, attempted, estimator_curves, shown_rmse
 
-from .time_to_accuracy import ROLLOUTS
+from .time_to_accuracy import ROLLOUTS, couples_samples, declares
 
 WORKS, FAILS, OPEN, NO_RESULT = "works", "fails", "open", "no result"
 """Verdicts of a method at a setting: its interval is below 1; above 1, or every estimate is 0; contains 1 or is not known; it
@@ -133,19 +132,9 @@ def has_law(rows: pd.DataFrame) -> pd.Series:
 
     A bias is constant where an estimate is a mean of terms. Weights that depend on all samples change it with their number.
     """
-    is_coupled = (rows["draws"] != "iid") | declares(rows, "couples_samples")
     # ``separable`` is of sample means
     is_constant = declares(rows, "separable") | declares(rows, "unbiased")
-    return ~is_coupled & is_constant & ~declares(rows, "fixed_work")
-
-
-def declares(rows: pd.DataFrame, fact: str) -> pd.Series:
-    """Return whether the estimator of each row, with its defaults, declares a fact, such as ``fixed_work``."""
-    names = {name for name, entry in registry.entries()["estimators"].items() if entry.plugin}
-    declared = {
-        name: bool(getattr(registry.make("estimators", name), fact, False)) for name in names & {*rows["estimator"]}
-    }
-    return rows["estimator"].map(declared).eq(True)
+    return ~couples_samples(rows) & is_constant & ~declares(rows, "fixed_work")
 
 
 def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:

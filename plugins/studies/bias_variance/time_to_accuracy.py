@@ -120,10 +120,18 @@ def required_cost(curve: pd.DataFrame, target: float, cost: str) -> RequiredCost
     return replace(way, down=down, up=up, times=times)
 
 
-def couples_samples(row: Any) -> bool:
-    """Return whether the samples of a row's estimates are chosen together, so that v / N need not hold."""
-    entry = registry.entries()["estimators"].get(row["estimator"])
-    return row["draws"] != "iid" or bool(getattr(entry and entry.plugin, "couples_samples", False))
+def declares(rows: pd.DataFrame, fact: str) -> pd.Series:
+    """Return whether the estimator of each row, with its defaults, declares a fact, such as ``fixed_work``."""
+    names = {name for name, entry in registry.entries()["estimators"].items() if entry.plugin}
+    declared = {
+        name: bool(getattr(registry.make("estimators", name), fact, False)) for name in names & {*rows["estimator"]}
+    }
+    return rows["estimator"].map(declared).eq(True)
+
+
+def couples_samples(rows: pd.DataFrame) -> pd.Series:
+    """Return whether the samples of each row's estimates are chosen together, so that v / N need not hold."""
+    return (rows["draws"] != "iid") | declares(rows, "couples_samples")
 
 
 def _cost_of_one_sample(rows: pd.DataFrame, cost: str) -> float:
@@ -157,7 +165,8 @@ def _required_cost(rows: pd.DataFrame, target: float, cost: str) -> RequiredCost
     n, error, price = rows[["x", "rmse_rel", cost]].to_numpy(float).T
     if not (error <= target).any():
         work = rows["rollouts"] + rows["gradients"]
-        return _extrapolated_cost(rows.iloc[-1], price[-1], target, is_fixed=work.nunique() == 1 < len(rows))
+        has_no_law = bool(couples_samples(rows).iloc[-1]) or work.nunique() == 1 < len(rows)
+        return _extrapolated_cost(rows.iloc[-1], price[-1], target, has_no_law)
     # more samples may cost less: the fixed cost of a call dominates small batches
     ways = [RequiredCost("measured" if i else "at once", price[i], n[i]) for i in np.flatnonzero(error <= target)]
     for i in range(1, len(n)):
@@ -168,20 +177,19 @@ def _required_cost(rows: pd.DataFrame, target: float, cost: str) -> RequiredCost
     return min(ways, key=lambda way: (way.cost, way.samples))
 
 
-def _extrapolated_cost(row: Any, price: float, target: float, is_fixed: bool) -> RequiredCost:
+def _extrapolated_cost(row: Any, price: float, target: float, has_no_law: bool) -> RequiredCost:
     """Extrapolate the cost from the row with most samples: v is N times its variance, and cost is proportional to N.
 
-    Coupled samples have no such law, and neither has an estimator whose work ``is_fixed`` for all N.
+    It ``has_no_law`` where samples are coupled or the work is the same for all N.
     """
     low, high, bias = (row[name] / row["reference_norm"] for name in ("bias_low", "bias_high", "bias"))
     # an estimator without declared bias may only have heavy tails that the samples missed
     if low >= target and not is_unexplained(str(row.get("reason", ""))):
         return RequiredCost("never")
-    is_coupled, samples = is_fixed or couples_samples(row), row["x"]
-    is_known = not is_coupled and high < target
+    samples, is_known = row["x"], not has_no_law and high < target
     certain_bias = bias if is_known and low > 0 else 0.0
     needed = samples * row["variance"] / row["reference_norm"] ** 2 / (target**2 - certain_bias**2)
-    factor = 1.0 if is_coupled else max(needed / samples, 1.0)
+    factor = 1.0 if has_no_law else max(needed / samples, 1.0)
     if not is_known:
         return RequiredCost("unknown", beyond=price * factor)
     return RequiredCost("extrapolated", price * factor, samples * factor)
