@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import bench.compare
 import bench.examine
 import bench.run
-from bench.errors import Unsupported, UserError, needing_sweeps
+from bench.errors import Unavailable, Unsupported, UserError, needing_sweeps
 
 if TYPE_CHECKING:
     from bench import plugin
@@ -27,6 +27,7 @@ else:
 
 __version__ = "0.5.0"
 __all__ = [
+    "Unavailable",
     "Unsupported",
     "UserError",
     "compare",

@@ -448,7 +448,7 @@ def _shard(config: Mapping[str, Any]) -> tuple[int, int] | None:
     found = re.fullmatch(r"(\d+)/(\d+)", text, re.ASCII)
     number, count = map(int, found.groups()) if found else (0, 0)
     if not 1 <= number <= count:
-        raise UserError(f"shard={printable(text)} must be NUMBER/COUNT: of 64 shards, 1/64 to 64/64")
+        raise UserError(f"shard={printable(text)} must be NUMBER/COUNT, such as 3/64, with NUMBER from 1 to COUNT")
     if config["ladder"]:
         raise UserError("ladder=true needs the rows of all scenes, and shard= runs some: leave one of them out")
     return number, count

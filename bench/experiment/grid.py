@@ -285,6 +285,8 @@ def _plugin(
                 f"sweep axis '{name}' is a parameter of both {used[name]} and {plugin.name}: "
                 f"write sweep.{used[name]}.{parameter} or sweep.{plugin.name}.{parameter}"
             )
+        if parameter in dict(choice.values):
+            raise UserError(f"{choice} gives {parameter}, which the sweep varies: leave one of them out")
         used[name] = plugin.name
     # later values replace earlier ones: the scene's contact values, settings, identity string, sweep
     values = dict(_of_scene(scene, plugin), **experiment.values.get(axis, {}).get(plugin.name, {}))

@@ -64,6 +64,8 @@ class Estimator(Plugin):
     """Whether its directions are chosen together or a model is fitted to them, so that the variance may fall faster than 1/N."""
     gives_gradient: ClassVar[bool] = True
     """Whether the estimate is a gradient that an optimizer can use."""
+    least_samples: ClassVar[int] = 1
+    """Fewest samples of an estimate."""
     in_units: ClassVar[bool] = False
     """Whether it computes a variance, a quantile or a baseline from the samples of an estimate, and does so over the units
     of :meth:`design`, whose samples are not independent of each other."""
@@ -126,6 +128,8 @@ class Estimator(Plugin):
         Points cover the directions in theta space of an estimator that uses them, otherwise all noise but the scene's own.
         An estimator that compares samples gets at least 4 units, since it may treat only these as independent.
         """
+        if samples < self.least_samples:
+            raise Unsupported(f"{self.name} needs at least {self.least_samples} samples, got {samples}")
         if self.draws == "iid" and not self.mirrored:
             return IID
         if self.draws not in POINTS or not isinstance(self.mirrored, bool):
@@ -155,7 +159,8 @@ class Estimator(Plugin):
         block = block_of(self.draws, width, count, self.in_units)
         if self.draws == "sobol" and (block < 1 or block & (block - 1) or count % block):
             raise Unsupported(
-                f"Sobol sets have a power of 2 of points: samples={samples} gives sets of {count / (count // max(block, 1)):g}"
+                f"Sobol sets have a power of 2 of points: samples={samples} gives sets of {count / (count // max(block, 1)):g}; "
+                f"samples={1 << max(samples, 2 * UNITS - 1).bit_length()} gives a power of 2"
             )
         if block == 1 < width and self.draws != "iid":
             raise Unsupported(
@@ -246,13 +251,10 @@ def halves(
     """Return first-order terms of the first half of the samples and zeroth-order terms of the rest, each ``(R, K, d)``.
 
     A term is the mean over a ``unit`` of samples that are drawn together, and no unit is in both halves. The zeroth-order
-    terms are (f - b) times the score, b being f at w = 0, or with ``leave_out`` the mean cost of the other units. Raises
-    ValueError for fewer than 4 units.
+    terms are (f - b) times the score, b being f at w = 0, or with ``leave_out`` the mean cost of the other units. There
+    are at least 4 units.
     """
-    units = noise.shape[1] // unit
-    if units < 4:
-        raise ValueError(f"needs at least 4 samples, got {units}")
-    half = units // 2 * unit
+    half = noise.shape[1] // unit // 2 * unit
     rest = noise[:, half:]
     zeroth = against_others(problem, theta, rest, unit) if leave_out else zeroth_order(problem, theta, rest)
     return per_unit(first_order(problem, theta, noise[:, :half]), unit), per_unit(zeroth, unit)

@@ -40,6 +40,11 @@ class AlphaOrder(DiagnosticEstimator):
     delta: float = param(0.05, "failure probability of the confidence radius", positive=True, high=1.0)
     bound: float | None = param(None, "L, bound on |zeroth-order term|; null: the largest in the batch", positive=True)
 
+    @property
+    def least_samples(self) -> int:  # type: ignore[override]
+        """Two for a variance, in each half."""
+        return 4 if self.sharing == "split" else 2
+
     def remark(self, diagnostics: Mapping[str, Mapping[str, float]]) -> str:
         """Return a doubt where few estimates reach the cap, and differ from the others by much more than these vary."""
         ratio = self.ratio if self.gamma is None else self.gamma / max(diagnostics["eps"]["median"], 1e-300)
@@ -52,15 +57,10 @@ class AlphaOrder(DiagnosticEstimator):
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
     ) -> tuple[np.ndarray, Auxiliaries]:
-        """Return the estimates ``(R, d)`` with alpha and eps, each ``(R,)``.
-
-        Raises ValueError for fewer than 2 samples, or fewer than 4 with ``sharing=split``.
-        """
+        """Return the estimates ``(R, d)`` with alpha and eps, each ``(R,)``."""
         unit = self.design(problem.program, noise.shape[1]).unit
         if self.sharing == "split":
             first, zeroth = halves(problem, theta, noise, unit)
-        elif noise.shape[1] < 2:
-            raise ValueError("needs at least 2 samples, got 1")
         else:
             orders = first_order(problem, theta, noise), zeroth_order(problem, theta, noise)
             first, zeroth = (per_unit(terms, unit) for terms in orders)

@@ -23,14 +23,13 @@ class ControlVariate(DiagnosticEstimator):
     needs = frozenset({"value", "grad", "score"})
     unbiased_at_discontinuities = True
     in_units = True
+    least_samples = 4
     diagnostics = ("coefficient",)
 
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
     ) -> tuple[np.ndarray, Auxiliaries]:
-        """Return the estimates ``(R, d)``, and ``coefficient``, ``(R,)``. Raises ValueError for fewer than 4 samples."""
-        if noise.shape[1] < 4:
-            raise ValueError(f"{self.name} needs at least 4 samples, got {noise.shape[1]}")
+        """Return the estimates ``(R, d)``, and ``coefficient``, ``(R,)``."""
         centre = problem.grad(theta, np.zeros((noise.shape[2], 1)))[:, 0]
         zeroth = zeroth_order(problem, theta, noise)
         w = columns(noise)[: problem.dim]

@@ -21,6 +21,7 @@ class InverseVariance(DiagnosticEstimator):
     needs = frozenset({"value", "grad", "score"})
     unbiased = False
     in_units = True
+    least_samples = 4
     diagnostics = ("weight",)
 
     def estimate_with_diagnostics(

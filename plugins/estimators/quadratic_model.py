@@ -34,6 +34,7 @@ class QuadraticModel(DiagnosticEstimator):
     unbiased_at_discontinuities = True
     couples_samples = True
     needs_independent_samples = True
+    least_samples = 4
     diagnostics = ("explained",)
 
     block: int = param(256, "largest number of samples in one fit", low=4)
@@ -41,10 +42,8 @@ class QuadraticModel(DiagnosticEstimator):
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
     ) -> tuple[np.ndarray, Auxiliaries]:
-        """Return the estimates ``(R, d)``, and ``explained``, ``(R,)``. Raises ValueError for fewer than 4 samples."""
+        """Return the estimates ``(R, d)``, and ``explained``, ``(R,)``."""
         count = noise.shape[1]
-        if count < 4:
-            raise ValueError(f"{self.name} needs at least 4 samples, got {count}")
         f = per_repeat(problem.value(theta, columns(noise)), noise)
         total = np.zeros((len(noise), problem.dim))
         unexplained = np.zeros(len(noise))

@@ -28,6 +28,11 @@ class Reinforce(SampleMean):
         return not self.separable
 
     @property
+    def least_samples(self) -> int:  # type: ignore[override]
+        """The baseline of a sample is the mean of others."""
+        return 1 + self.in_units
+
+    @property
     def separable(self) -> bool:
         """Whether the term of each sample depends on that sample only."""
         return self.baseline != "leave_one_out"
@@ -42,11 +47,9 @@ class Reinforce(SampleMean):
         return f * problem.score(theta, w)
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return the mean of the terms over samples, ``(R, d)``; ValueError if the baseline needs more samples."""
+        """Return the mean of the terms over samples, ``(R, d)``."""
         if self.separable:
             return super().estimate(problem, theta, noise)
-        if noise.shape[1] < 2:
-            raise ValueError("baseline leave_one_out needs at least 2 samples")
         w = columns(noise)
         f = per_repeat(problem.value(theta, w), noise)
         f = less_others(f, self.design(problem.program, f.shape[1]).unit)

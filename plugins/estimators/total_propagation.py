@@ -48,6 +48,7 @@ class TotalPropagation(DiagnosticEstimator):
     needs = frozenset({"value", "grad", "score"})
     unbiased = False
     in_units = True
+    least_samples = 2
     diagnostics = ("weight",)
 
     per: str = param("step", "the unit with a common weight", choices=("step", "control", "action"))
@@ -60,12 +61,10 @@ class TotalPropagation(DiagnosticEstimator):
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
     ) -> tuple[np.ndarray, Auxiliaries]:
-        """Return the estimates ``(R, d)`` and the first-order weights. Raises ValueError for a single sample.
+        """Return the estimates ``(R, d)`` and the first-order weights.
 
         The weights are ``(R, d)``, or ``(R, horizon * n_u)`` with ``per=action``.
         """
-        if noise.shape[1] < 2:
-            raise ValueError(f"{self.name} needs at least 2 samples, got 1")
         if self.per == "action":
             return self._per_action(problem, theta, noise)
         unit = self.design(problem.program, noise.shape[1]).unit

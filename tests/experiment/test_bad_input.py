@@ -94,7 +94,11 @@ REFUSED = {
     "path=[penalty]": "a contact law, an integrator",
     "sweep.seed=range(0,99999999)": "values, and more than",
     f"sweep.seed=[{MANY}] sweep.samples=[{MANY}] sweep.repeats=[{MANY}]": "the sweep has 10360232 cells",
-    **{f"shard='{shard}'": "must be NUMBER/COUNT: of 64 shards, 1/64 to 64/64" for shard in ("65/64", "a/b")},
+    **{
+        f"shard='{shard}'": "must be NUMBER/COUNT, such as 3/64, with NUMBER from 1 to COUNT"
+        for shard in ("65/64", "a/b")
+    },
+    "estimators=[fobg[draws=sobol]] draws=iid": "fobg[draws=sobol] gives draws, which the sweep varies: leave one",
     "name=claims": "name=claims is reserved",
     "scenes=[quadratic] sweep.theta0.9=[1]": "theta has 5 coordinates",
     "scenes=[quadratic] sweep.theta0.0=[inf]": "must be finite",

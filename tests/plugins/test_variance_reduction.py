@@ -5,6 +5,7 @@ import pytest
 from bench.plugins.scenes.linear import Linear
 from classes import Cubic, Numpy, OptimalBaseline, QuadraticModel
 
+from bench.errors import Unsupported
 from bench.model import compose
 
 ROUNDING = 1e-9
@@ -42,8 +43,8 @@ def test_quadratic_model_is_fitted_without_the_sample_it_is_subtracted_from(samp
     np.testing.assert_allclose(values, expected, rtol=ROUNDING)
 
 
-def test_too_few_samples_are_an_error_that_says_how_many_are_needed():
+def test_too_few_samples_are_refused_and_the_reason_says_how_many_are_needed():
     p = problem(Linear())
     for estimator, needed in ((OptimalBaseline(), 2), (QuadraticModel(), 4)):
-        with pytest.raises(ValueError, match=f"{estimator.name} needs at least {needed} samples, got {needed - 1}"):
-            estimator.estimate(p, p.program.theta0, drawn(1, needed - 1, p.dim))
+        with pytest.raises(Unsupported, match=f"{estimator.name} needs at least {needed} samples, got {needed - 1}"):
+            estimator.design(p.program, needed - 1)
