@@ -78,14 +78,6 @@ def test_record_of_a_run_outlasts_one_that_finds_all_rows_stored(tmp_path):
     assert json.loads(path.read_text())["counts"] == {"ok": 2}
 
 
-def test_a_failing_cell_is_a_row_and_exit_status_1(tmp_path):
-    assert main([*TINY, f"results_dir={tmp_path}", "samples=1", "estimators=[fobg,inverse_variance]"]) == 1
-    table = pd.read_csv(tmp_path / "tiny" / "bias_variance.csv").set_index("estimator")
-    assert table.loc["fobg", "status"] == "ok"
-    assert table.loc["inverse_variance", "status"] == "error"
-    assert "at least 4 samples" in table.loc["inverse_variance", "reason"]
-
-
 def test_identity_columns_tell_cells_apart():
     words = [
         "scenes=[pushing]",
