@@ -53,8 +53,6 @@ INSIDE = (
 """Starts of the paths of code that is not from outside: libraries, this package with its plugins, the standard library."""
 IGNORED = ("/dev/", "/proc/", "/sys/", *INSIDE)
 CACHES = ("/__pycache__/", "/.cache/", os.environ.get("XDG_CACHE_HOME") or "/.cache/")
-SEVERAL = "several contents"
-"""Stands for the hash of a file that has changed while it was in use, which no content has."""
 STARTED_NS = time.time_ns()
 
 _read: dict[str, str] = {}
@@ -182,7 +180,8 @@ def _path_of(name: str) -> str:
 
 def _add(name: str, content: str) -> None:
     if _read.get(name) != content:
-        _read[name] = SEVERAL if name in _read else content
+        # a file that has changed while it was in use counts as one whose hash no content has
+        _read[name] = "several contents" if name in _read else content
         _texts.clear()
 
 

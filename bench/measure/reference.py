@@ -33,7 +33,6 @@ FAR = 4.5
 """Distance searched for jumps on either side along a direction, in standard deviations."""
 ROUNDING = 1e-9
 """Difference of first and zeroth order, relative to the gradient, that rounding explains."""
-ROUNDOFFS = 100.0
 COMMON_ERROR = 1e-10
 """Relative error common to the terms of all samples, from rounding and central differences."""
 EXTREME = 1e100
@@ -145,9 +144,9 @@ def transferred(reference: Reference, problem: Problem, other: Problem, samples:
             mine, others = problem.value(theta, w), other.value(theta, w)
             spread = np.ptp(mine[np.isfinite(mine)]) if np.isfinite(mine).any() else 0.0
             # difference between two backends' costs of one draw, relative to the range of costs, that rounding
-            # explains. The root of the coarser unit roundoff is allowed too, and :data:`ROUNDOFFS` roundoffs of the cost
+            # explains. The root of the coarser unit roundoff is allowed too, and 100 roundoffs of the cost
             # itself
-            allowed = max(1e-6, math.sqrt(unit)) * spread + ROUNDOFFS * unit * np.abs(mine)
+            allowed = max(1e-6, math.sqrt(unit)) * spread + 100.0 * unit * np.abs(mine)
             agrees = (mine == others) | (np.abs(others - mine) <= allowed) | (np.isnan(mine) & np.isnan(others))
             share += float(1.0 - agrees.mean()) / blocks
             apart = np.where(agrees, 0.0, others - mine)
