@@ -78,15 +78,6 @@ def test_record_of_a_run_outlasts_one_that_finds_all_rows_stored(tmp_path):
     assert json.loads(path.read_text())["counts"] == {"ok": 2}
 
 
-def test_a_failing_cell_is_a_row_and_exit_status_1_and_a_refused_one_is_a_row(tmp_path):
-    (tmp_path / "escaping.py").write_text(ESCAPING)
-    estimators = "estimators=[fobg,escaping,inverse_variance]"
-    assert main([*TINY, f"results_dir={tmp_path}", "samples=1", estimators, f"plugins={tmp_path}"]) == 1
-    table = pd.read_csv(tmp_path / "tiny" / "bias_variance.csv").set_index("estimator")
-    assert dict(table["status"]) == {"fobg": "ok", "escaping": "error", "inverse_variance": "unsupported"}
-    assert "at least 4 samples" in table.loc["inverse_variance", "reason"]
-
-
 def test_identity_columns_tell_cells_apart():
     words = [
         "scenes=[pushing]",

@@ -22,8 +22,6 @@ from bench.run.files import make_directory, write_all
 
 CHANGED = 1.01
 """Smallest factor by which an error counts as changed."""
-PANELS = 16
-"""Most series that are drawn."""
 ERROR = Column("error", label="relative error", digits=3)
 ERRORS = ("paired", "interval", "exact")
 """Comparison rules of columns that contain an error. An experiment is followed by the first such column with a value."""
@@ -35,8 +33,6 @@ NOTES = (
     "1 is better.",
     "gradient moved: largest distance of a cell's gradient from that of the first result, relative to its norm.",
 )
-LONGEST = 18
-"""Largest number of characters of a result's name in the chart, from its end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +130,7 @@ def views(history: History) -> Views:
     )
     parts = dict(iter(table.groupby("line", sort=False)))
     moved = [name for name, part in parts.items() if _is_changed(part)]
-    frame = pd.concat([parts[name] for name in (moved or [*parts])[:PANELS]], ignore_index=True)
+    frame = pd.concat([parts[name] for name in (moved or [*parts])[:16]], ignore_index=True)
     failures = {
         str(name): f"failed: {', '.join(map(str, part['failed']))} of {part['of'].iloc[0]}"
         for name, part in frame.groupby("line")
@@ -176,4 +172,4 @@ def _short_names(names: Sequence[str]) -> dict[str, str]:
     parts = [re.split(r"(?=[:/])", name.rstrip("/")) for name in names]
     while all(len(part) > 1 and part[-1] == parts[0][-1] for part in parts):
         parts = [part[:-1] for part in parts]
-    return {name: "".join(part)[-LONGEST:] for name, part in zip(names, parts, strict=True)}
+    return {name: "".join(part)[-18:] for name, part in zip(names, parts, strict=True)}

@@ -20,8 +20,6 @@ from bench.report.text import duration
 
 EFFECT = 1.5
 """Smallest ratio at which a time counts as changed."""
-LEAST_SPREAD = 0.05
-"""Lower bound of the assumed standard deviation of a logarithmic time between runs."""
 ALPHA = 1e-3
 """Significance level on each side."""
 RUNS = 3
@@ -55,7 +53,8 @@ def judge_times(
         return {}, ["no cell is in all runs of before, so times are not judged"]
     n_unjudged, count = len(runs) - len(complete), runs.shape[1]
     remark = f"times of {n_unjudged} cells are not judged, since some run of before lacks the cell"
-    spread = max(LEAST_SPREAD, float(np.sqrt(complete.var(axis=1, ddof=1).mean())))
+    # the standard deviation of a logarithmic time between runs, at least 5%
+    spread = max(0.05, float(np.sqrt(complete.var(axis=1, ddof=1).mean())))
     limit = max(math.log(EFFECT), float(stdtrit(count - 1, 1 - ALPHA)) * spread * math.sqrt(1 + 1 / count))
     growth = new[complete.index] - complete.mean(axis=1)
     changes = {

@@ -12,9 +12,9 @@ import numpy as np
 
 from bench.conformance.kit import Failed, Skipped, require, skip_unless, verifies
 from bench.conformance.subjects import (
-    COLUMNS,
     DIFFERENCED,
     LIMIT,
+    N_COLUMNS,
     ROUNDED,
     SAME,
     BareScene,
@@ -54,7 +54,7 @@ from bench.model import (
 )
 from bench.model.backend import CAPABILITIES
 
-FAR = 1e200
+HUGE = 1e200
 """Size of a theta whose square overflows."""
 PRESSED = 1e-3
 """Penetration [m] at which the force of a contact with friction is compared."""
@@ -101,7 +101,7 @@ def value_agrees(backend: Backend) -> str:
     for program in programs:
         theta, w = samples(program)
         value = backend.compile(program).value(theta, w)
-        require(value.shape == (COLUMNS,), f"{describe(program)}: shape {value.shape}, not {(COLUMNS,)}")
+        require(value.shape == (N_COLUMNS,), f"{describe(program)}: shape {value.shape}, not {(N_COLUMNS,)}")
         # rollouts may have the same operations in another order
         allowed = _allowed(backend, program, {"float64": SAME, "float32": 1e-3}[_dtype(backend)])
         what = f"{describe(program)}: costs differ by more than {allowed:g}"
@@ -163,7 +163,7 @@ def gradient_is_that_of_value(backend: Backend) -> str:
         judged or dtype == "float64",
         "no gradient can be compared: the scenes' own programs are smooth on no column",
     )
-    return f"to {worst:.0e} on {judged} of {2 * len(programs) * COLUMNS} columns of {len(programs)} programs"
+    return f"to {worst:.0e} on {judged} of {2 * len(programs) * N_COLUMNS} columns of {len(programs)} programs"
 
 
 def _findings(backend: Backend, program: Program, distant: float, dtype: str) -> list[tuple[str, float]]:
@@ -184,7 +184,7 @@ def _findings(backend: Backend, program: Program, distant: float, dtype: str) ->
             lambda at: problem.value(at[:d], at[d:]),
             np.concatenate([theta, w]),
             np.concatenate([e, 0.0 * w]),
-            np.ones(COLUMNS),
+            np.ones(N_COLUMNS),
             (gradient * e).sum(axis=0),
             float(np.finfo(_dtype(backend)).eps),
             EPS if dtype == "float64" else SINGLE_EPS,
@@ -248,9 +248,9 @@ def columns_are_independent(backend: Backend) -> str:
     worst, runs = 0.0, list(compiled(backend))
     for program, problem, theta, w in runs:
         for capability in sorted(backend.provides & {"value", "grad", "score"}):
-            function, rest = getattr(problem, capability), np.arange(COLUMNS) != 2
+            function, rest = getattr(problem, capability), np.arange(N_COLUMNS) != 2
             whole, other = function(theta, w), function(*with_changed_column(theta, w))
-            is_shaped = whole.shape == ((COLUMNS,) if capability == "value" else theta.shape)
+            is_shaped = whole.shape == ((N_COLUMNS,) if capability == "value" else theta.shape)
             require(is_shaped and whole.dtype == np.float64, f"{capability} is {whole.dtype}{whole.shape}")
             require(np.isfinite(whole).all(), f"{capability} of {describe(program)} is not finite")
             compared = {
@@ -258,7 +258,7 @@ def columns_are_independent(backend: Backend) -> str:
                 "the order of columns matters": (function(theta[:, ::-1], w[:, ::-1])[..., ::-1], whole),
             }
             if program is runs[-1][0]:
-                spread = function(np.repeat(program.theta0[:, None], COLUMNS, axis=1), w)
+                spread = function(np.repeat(program.theta0[:, None], N_COLUMNS, axis=1), w)
                 compared["theta (d,) and (d, B) differ"] = function(program.theta0, w), spread
                 compared["a single column differs"] = function(program.theta0, w[:, :1]), spread[..., :1]
             for what, both in compared.items():
@@ -276,7 +276,7 @@ def failed_rollouts_have_no_gradient(backend: Backend) -> str:
     skip_unless("grad" in backend.provides, "computes no gradients")
     lost, plain = [], plain_backend()
     for program, problem, theta, w in compiled(backend):
-        far = np.where(np.arange(COLUMNS) == 1, FAR * (1.0 + np.abs(theta)), theta)
+        far = np.where(np.arange(N_COLUMNS) == 1, HUGE * (1.0 + np.abs(theta)), theta)
         with np.errstate(all="ignore"):
             failed = ~np.isfinite(problem.value(far, w))
             gone = ~np.isfinite(problem.grad(far, w)).all(axis=0)
@@ -285,7 +285,7 @@ def failed_rollouts_have_no_gradient(backend: Backend) -> str:
                 require(failed[beyond].all(), f"{describe(program)}: a rollout that overflows has a finite cost")
         require(gone[failed].all(), f"{describe(program)}: a cost that is not finite has a finite gradient")
         lost.append(failed.any())
-    skip_unless(any(lost), f"no rollout fails {FAR:g} away")
+    skip_unless(any(lost), f"no rollout fails {HUGE:g} away")
     return f"{sum(lost)} programs"
 
 
@@ -465,8 +465,8 @@ def root_is_differentiated_implicitly(backend: Backend) -> str:
     skip_unless("root" in backend.provides, "solves no equations")
     offs = []
     for n in (1, 3) if backend == type(backend)() else (3,):
-        z = rng("root").uniform(-1.0, 1.0, (n, COLUMNS))
-        theta, w = _coupled(np, n, z), np.zeros((n, COLUMNS))
+        z = rng("root").uniform(-1.0, 1.0, (n, N_COLUMNS))
+        theta, w = _coupled(np, n, z), np.zeros((n, N_COLUMNS))
         weights = np.arange(1.0, n + 1.0)
         jacobian = COUPLING[:n, :n, None] + np.eye(n)[:, :, None] * (3 * z * z + 0.1 * z[0] * z[0])[:, None]
         jacobian[:, 0] += 0.2 * z * z[0]

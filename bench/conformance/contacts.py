@@ -60,7 +60,7 @@ def _push(law: ContactLaw, gap: Any, rate: Any, ops: Ops | None = None) -> np.nd
     return np.stack([scene.masses[0] * change[0] + upper, upper])
 
 
-FAR = ([[0.05, 0.2, 1.0], [0.05, 0.2, 1.0]], [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+SEPARATED = ([[0.05, 0.2, 1.0], [0.05, 0.2, 1.0]], [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Gaps [m] and gap rates [m/s], by contact, of bodies that do not meet within the step."""
 
 
@@ -68,17 +68,17 @@ def _sharpened(law: ContactLaw, factor: float) -> ContactLaw:
     """Return the law with its smoothing multiplied or divided by ``factor``, whichever pushes less at a distance."""
     value = getattr(law, law.smoothing)
     changed = [dataclasses.replace(law, **{law.smoothing: value * f}) for f in (factor, 1 / factor)]
-    return min(changed, key=lambda one: np.abs(_push(one, *FAR)).max())
+    return min(changed, key=lambda one: np.abs(_push(one, *SEPARATED)).max())
 
 
 @verifies(ContactLaw)
 def does_not_push_from_afar(law: ContactLaw) -> str:
     """Verify that separated bodies get no force, or, under a smoothed law, a force that vanishes with the smoothing."""
-    push = np.abs(_push(law, *FAR)).max() / PUSH_DT
+    push = np.abs(_push(law, *SEPARATED)).max() / PUSH_DT
     if not law.smoothing:
         require(push == 0, f"a force of {push:.3g} N on separated bodies")
         return "no force on separated bodies"
-    sharp = np.abs(_push(_sharpened(law, 100.0), *FAR)).max() / PUSH_DT
+    sharp = np.abs(_push(_sharpened(law, 100.0), *SEPARATED)).max() / PUSH_DT
     detail = f"{push:.2g} N at 5 cm or more, {sharp:.2g} N at 100 times sharper {law.smoothing}"
     require(sharp <= 0.05 * push + 1e-12, detail)
     return detail

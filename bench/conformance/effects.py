@@ -23,7 +23,7 @@ from bench.model import (
     compose,
 )
 
-COLUMNS = 16
+N_COLUMNS = 16
 """Thetas, each with its noise, at which costs are compared."""
 
 
@@ -81,9 +81,9 @@ def _moving(scene: Scene, law: ContactLaw | None, axis: str) -> set[str]:
         for name, part in given.items()
     }
     theta, own = near["scene"].theta0(), compose(near["scene"], near["contact"], _integrator(scene))
-    apart = 0.3 * (1.0 + np.abs(theta[:, None])) * draw.standard_normal((theta.size, COLUMNS))
+    apart = 0.3 * (1.0 + np.abs(theta[:, None])) * draw.standard_normal((theta.size, N_COLUMNS))
     apart[:, 0] = 0.0
-    w = draw.standard_normal((own.n_noise, COLUMNS))
+    w = draw.standard_normal((own.n_noise, N_COLUMNS))
 
     def costs(parts: dict[str, Any]) -> np.ndarray:
         program = compose(parts["scene"], parts["contact"], _integrator(scene))

@@ -9,16 +9,16 @@ from bench.conformance.subjects import ROUNDED, agree, available, rng
 from bench.gradient import Options, check
 from bench.model import Policy
 
-INPUTS, OUTPUTS, COLUMNS = 3, 2, 5
+INPUTS, OUTPUTS, N_COLUMNS = 3, 2, 5
 """Numbers of observations, controls and columns of the checks."""
 MANY = 40
 """Number of columns in which every unit of a network is active somewhere."""
 
 
-def _subject(policy: Policy, columns: int = COLUMNS) -> tuple[np.ndarray, np.ndarray]:
-    """Return a theta ``(d, COLUMNS)`` around the initial one and observations ``(INPUTS, columns)``."""
+def _subject(policy: Policy, columns: int = N_COLUMNS) -> tuple[np.ndarray, np.ndarray]:
+    """Return a theta ``(d, N_COLUMNS)`` around the initial one and observations ``(INPUTS, columns)``."""
     random, theta = rng("policy"), policy.initial(INPUTS, OUTPUTS)
-    spread = 0.1 * random.standard_normal((len(theta), COLUMNS))
+    spread = 0.1 * random.standard_normal((len(theta), N_COLUMNS))
     return theta[:, None] + spread, random.standard_normal((INPUTS, columns))
 
 
@@ -38,12 +38,12 @@ def shared_theta_acts_like_columns(policy: Policy) -> str:
     """Verify that a theta ``(d, 1)`` and the same theta repeated ``(d, B)`` give the same controls ``(n_outputs, B)``."""
     theta, observations = _subject(policy)
     shared = policy.act(np, theta[:, :1], observations)
-    repeated = policy.act(np, np.repeat(theta[:, :1], COLUMNS, axis=1), observations)
-    require(shared.shape == (OUTPUTS, COLUMNS), f"controls are {shared.shape}, not {(OUTPUTS, COLUMNS)}")
+    repeated = policy.act(np, np.repeat(theta[:, :1], N_COLUMNS, axis=1), observations)
+    require(shared.shape == (OUTPUTS, N_COLUMNS), f"controls are {shared.shape}, not {(OUTPUTS, N_COLUMNS)}")
     agree(shared, repeated, ROUNDED, "a shared theta and its copies differ")
     changed = observations.copy()
     changed[:, 2] += 1.0
-    others = np.arange(COLUMNS) != 2
+    others = np.arange(N_COLUMNS) != 2
     off = agree(
         policy.act(np, theta, changed)[:, others],
         policy.act(np, theta, observations)[:, others],

@@ -12,9 +12,9 @@ import numpy as np
 
 from bench.conformance.kit import Failed, Skipped, require, skip_unless, verifies
 from bench.conformance.subjects import (
-    COLUMNS,
     DIFFERENCED,
     LIMIT,
+    N_COLUMNS,
     ROUNDED,
     SAME,
     able_backend,
@@ -84,10 +84,10 @@ def costs_are_finite(scene: Scene) -> str:
     for program in subjects:
         (theta, w), problem = samples(program), able_backend(program).compile(program)
         cost = problem.value(theta, w)
-        require(cost.shape == (COLUMNS,), f"{describe(program)}: shape {cost.shape}, not {(COLUMNS,)}")
+        require(cost.shape == (N_COLUMNS,), f"{describe(program)}: shape {cost.shape}, not {(N_COLUMNS,)}")
         require(np.isfinite(cost).all(), f"{describe(program)}: {(~np.isfinite(cost)).sum()} costs are not finite")
         other = problem.value(*with_changed_column(theta, w))
-        kept = np.arange(COLUMNS) != 2
+        kept = np.arange(N_COLUMNS) != 2
         agree(other[kept], cost[kept], ROUNDED, f"{describe(program)}: a column changes the cost of others")
     return f"{cost.mean():.4g} on average, {len(subjects)} programs"
 
@@ -364,9 +364,9 @@ def contact_geometry_is_consistent(scene: ContactScene) -> str:
     require(scene.n_contacts > 0, "n_contacts is 0: a ContactScene sets it to the number of its gaps")
     draw = rng("geometry")
     start = scene.initial_state(np, scene.theta0()[:, None])
-    q = start.q + 0.1 * draw.standard_normal((scene.n_q, COLUMNS))
-    v = start.v + draw.standard_normal((start.v.shape[0], COLUMNS))
-    shape = (scene.n_contacts, COLUMNS)
+    q = start.q + 0.1 * draw.standard_normal((scene.n_q, N_COLUMNS))
+    v = start.v + draw.standard_normal((start.v.shape[0], N_COLUMNS))
+    shape = (scene.n_contacts, N_COLUMNS)
     require(scene.gap(np, q).shape == shape, f"gap has shape {scene.gap(np, q).shape}, not {shape}")
     off = distance(scene.gap_rate(np, q, v), (scene.gap(np, q + 1e-6 * v) - scene.gap(np, q - 1e-6 * v)) / 2e-6)
     # 1e-6: central differences of step 1e-6 of a smooth gap have errors of 1e-10 by rounding and 1e-12 by truncation

@@ -46,7 +46,7 @@ DIFFERENCED = 1e-7
 """Relative error allowed where gradients may be central differences of step 1e-6: rounding causes 1e-10 of the cost."""
 PARTS = 512
 """Number of intervals of a line at the first level of a search for jumps."""
-COLUMNS = 6
+N_COLUMNS = 6
 """Number of samples on which backends are compared, always the same since some backends compile for each number."""
 
 
@@ -201,15 +201,15 @@ def rng(*key: str | int) -> np.random.Generator:
 
 
 def samples(program: Program) -> tuple[np.ndarray, np.ndarray]:
-    """Return :data:`COLUMNS` thetas near theta0, ``(d, B)``, and noise ``(n_w, B)``."""
+    """Return :data:`N_COLUMNS` thetas near theta0, ``(d, B)``, and noise ``(n_w, B)``."""
     draw = rng("samples", program.scene.name)
-    theta = program.theta0[:, None] + 0.1 * program.scene.sigma * draw.standard_normal((program.dim, COLUMNS))
-    return theta, draw.standard_normal((program.n_noise, COLUMNS))
+    theta = program.theta0[:, None] + 0.1 * program.scene.sigma * draw.standard_normal((program.dim, N_COLUMNS))
+    return theta, draw.standard_normal((program.n_noise, N_COLUMNS))
 
 
 def with_changed_column(theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return copies of theta ``(d, B)`` and noise ``(n_w, B)`` with column 2 changed."""
-    column = np.arange(COLUMNS) == 2
+    column = np.arange(N_COLUMNS) == 2
     return theta + 1e-3 * column, w * (1 - 0.5 * column)
 
 

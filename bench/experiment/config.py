@@ -20,7 +20,7 @@ from bench.experiment.experiment import Budget, Choice, Execution, Experiment
 from bench.experiment.grid import COUNTS, check_axes, coerce_finite, parameter_name, refuse_too_many, share_of, swept
 from bench.experiment.overrides import (
     LISTS_AS,
-    TABLES,
+    MAPPINGS,
     Override,
     check_file,
     merge,
@@ -246,7 +246,7 @@ def _check_key(key: str) -> None:
     head = key.partition(".")[0]
     if head not in _known_keys():
         raise unknown("setting", key, {*_known_keys(), "experiment"}, "--help")
-    tables = {*map(singular, registry.kinds()), *TABLES}
+    tables = {*map(singular, registry.kinds()), *MAPPINGS}
     if key != head and (head not in tables or (head == "reference" and key.count(".") > 1)):
         whole = key.rpartition(".")[0]
         raise UserError(f"'{key}' is not a setting: '{whole}' has no settings of its own")

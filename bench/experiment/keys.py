@@ -26,8 +26,6 @@ SHARED = (noise, program)
 """Modules that decide the numbers of all cells."""
 COMPARED = (statistics,)
 """Modules that decide the numbers of cells that are compared with a reference."""
-PACKAGE = "bench"
-"""The package whose classes count by their revisions."""
 
 HASHED: dict[str, str] = {}
 """The hashes of files in keys, by path."""
@@ -103,7 +101,7 @@ def revisions_of(modules: Iterable[ModuleType]) -> dict[str, int]:
 
 
 def _is_own(module: str) -> bool:
-    return module.partition(".")[0] == PACKAGE
+    return module.partition(".")[0] == "bench"
 
 
 def files_hash(files: Iterable[Path]) -> str:

@@ -15,7 +15,7 @@ from bench.host.identity import split_items
 
 GLOBAL = "# @package _global_"
 """The first line of an experiment file, so that Hydra does not nest its settings."""
-TABLES = ("sweep", "marks", "compares", "reference")
+MAPPINGS = ("sweep", "marks", "compares", "reference")
 """Settings that are tables; the parameters of plugins are too."""
 LISTS_AS = "write key=value with lists as [a,b] and strings in quotes"
 
@@ -135,5 +135,5 @@ def _check_content(path: Path, text: str, content: Any) -> None:
         where = f"'{path}'" + (f", line {line}" if line else "")
         if not isinstance(key, str):
             raise UserError(f"{where}: {key!r} is not a setting: settings are names")
-        if key in TABLES and value is not None and not isinstance(value, dict):
+        if key in MAPPINGS and value is not None and not isinstance(value, dict):
             raise UserError(f"{where}: {key} must be a table, and is {repr(value)[:100]}: write {key}: {{name: value}}")

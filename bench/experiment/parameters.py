@@ -35,9 +35,9 @@ VIEWS = ("horizon", "dt", "sigma", "stiffness", "noise", "dtype", "smoothing")
 """Plugin parameters with their own columns, which are therefore omitted from identity strings."""
 PROBLEM = ("scene", "contact", "integrator")
 """The parts of the grid that decide the simulation, and so the gradient that estimates are compared with."""
-RECORDS = {"theta": Decision, "reference": Budget}
+HARNESS = {"theta": Decision, "reference": Budget}
 """Entries of a row's parameters that are dataclasses of the harness instead of plugins."""
-NOT_PLUGINS = ("study", *RECORDS)
+NOT_PLUGINS = ("study", *HARNESS)
 """Entries of a row's parameters that are not plugins on an axis of the grid."""
 
 
@@ -55,7 +55,7 @@ def completed(given: Mapping[str, Any]) -> dict[str, Any]:
         axis: part and _defaults(axis, part.get("name"), scene, registry.folders()) | part
         for axis, part in given.items()
     }
-    records = {name: result.pop(name, None) for name in RECORDS if given}
+    records = {name: result.pop(name, None) for name in HARNESS if given}
     return result | records
 
 
@@ -65,8 +65,8 @@ def _defaults(axis: str, name: str | None, scene: str | None, folders: tuple[Pat
 
     The scene's own values of contact parameters replace the contact law's. Parameters without a default are omitted.
     """
-    if axis in RECORDS:
-        return {field: plain(value) for field, value in dataclasses.asdict(RECORDS[axis]()).items()}
+    if axis in HARNESS:
+        return {field: plain(value) for field, value in dataclasses.asdict(HARNESS[axis]()).items()}
     plugin = plugin_class(axis, name)
     declared = parameters(plugin) if plugin else {}
     values = {key: one.default for key, one in declared.items() if one.default is not dataclasses.MISSING}
@@ -179,7 +179,7 @@ def _flat(texts: tuple[str, ...], folders: tuple[Path, ...]) -> pd.DataFrame:
         line |= {("theta", "", name): tuple(theta[name]) for name in ("names", "path") if theta.get(name)}
         line |= {(THETA, "", f"{THETA}.{i}" if len(at) > 1 else THETA): value for i, value in enumerate(at)}
         for part, entry in given.items():
-            if entry and part not in RECORDS:
+            if entry and part not in HARNESS:
                 values = {name: tuple(value) if isinstance(value, list) else value for name, value in entry.items()}
                 line |= {(part, entry["name"], name): value for name, value in values.items()}
         lines.append(line)

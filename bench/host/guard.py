@@ -16,7 +16,7 @@ from bench.errors import FOLDER, INTERRUPTED, UserError, printable
 
 MAX_CAPTURED_CHARACTERS = 300
 """Maximum number of characters of a plugin's output that are quoted."""
-LIBRARIES = ("bench", "builtins", "json", "math", "numpy", "os", "pandas", "scipy")
+PROTECTED = ("bench", "builtins", "json", "math", "numpy", "os", "pandas", "scipy")
 """Packages whose functions compute or store numbers in the process of a command."""
 
 
@@ -73,10 +73,10 @@ def contained() -> Iterator[None]:
 
 
 def library_functions() -> dict[tuple[str, str], object]:
-    """Return the functions and classes of the imported :data:`LIBRARIES` by names of module and attribute, and the modules."""
+    """Return the functions and classes of the imported :data:`PROTECTED` by names of module and attribute, and the modules."""
     found: dict[tuple[str, str], object] = {}
     for name, module in [*sys.modules.items()]:
-        if name.partition(".")[0] in LIBRARIES:
+        if name.partition(".")[0] in PROTECTED:
             found[name, ""] = module
             found |= {(name, key): one for key, one in [*getattr(module, "__dict__", {}).items()] if callable(one)}
     return found

@@ -40,21 +40,19 @@ SET_BY_RUNS = frozenset(
 )
 """Variables that a run sets in its workers."""
 _SITES = (*site.getsitepackages(), site.getusersitepackages())
-LIBRARIES = tuple(f"{place}/" for folder in _SITES for place in (folder, os.path.realpath(folder)))
+LIBRARY_PATHS = tuple(f"{place}/" for folder in _SITES for place in (folder, os.path.realpath(folder)))
 """Starts of the paths of installed libraries."""
-PACKAGE = Path(__file__).parents[1]
+PACKAGE_FOLDER = Path(__file__).parents[1]
 INSIDE = (
-    *LIBRARIES,
-    f"{PACKAGE}/",
-    f"{PACKAGE.parent}/plugins/",
+    *LIBRARY_PATHS,
+    f"{PACKAGE_FOLDER}/",
+    f"{PACKAGE_FOLDER.parent}/plugins/",
     f"{os.path.dirname(sysconfig.get_path('stdlib'))}/",
     "<frozen",
 )
 """Starts of the paths of code that is not from outside: libraries, this package with its plugins, the standard library."""
 IGNORED = ("/dev/", "/proc/", "/sys/", *INSIDE)
 CACHES = ("/__pycache__/", "/.cache/", os.environ.get("XDG_CACHE_HOME") or "/.cache/")
-CHANGED = "several contents"
-"""Stands for the hash of a file that has changed while it was in use, which no content has."""
 STARTED_NS = time.time_ns()
 
 _read: dict[str, str] = {}
@@ -182,7 +180,8 @@ def _path_of(name: str) -> str:
 
 def _add(name: str, content: str) -> None:
     if _read.get(name) != content:
-        _read[name] = CHANGED if name in _read else content
+        # a file that has changed while it was in use counts as one whose hash no content has
+        _read[name] = "several contents" if name in _read else content
         _texts.clear()
 
 
@@ -195,7 +194,7 @@ def _note_module(name: str, module: Any) -> None:
     file, parts = module.__file__, name.split(".")
     if not _is_outside(name, file):
         return
-    if file.startswith(LIBRARIES):
+    if file.startswith(LIBRARY_PATHS):
         _packages.add(parts[0])
     packages = [sys.modules.get(".".join(parts[: n + 1])) for n in range(len(parts))]
     if not any(getattr(package, "REVISION", 0) for package in packages):
@@ -207,7 +206,7 @@ def _note_module(name: str, module: Any) -> None:
 
 def _note_package(top: str) -> None:
     """Record the version of a library, or the content of its modules if it was installed from a folder."""
-    if str(getattr(sys.modules.get(top), "__file__", "")).startswith(LIBRARIES):
+    if str(getattr(sys.modules.get(top), "__file__", "")).startswith(LIBRARY_PATHS):
         library = _distribution_of(top)
         _add(f"package {library.name}", library.version)
         if '"file:' in (library.read_text("direct_url.json") or ""):
@@ -242,7 +241,7 @@ def _is_from_outside(through_libraries: bool) -> bool:
         if name.partition(".")[0] == OWN:
             return is_outside
         is_outside = is_outside or _is_outside(name, file)
-        if not (is_outside or through_libraries) and file.startswith(LIBRARIES):
+        if not (is_outside or through_libraries) and file.startswith(LIBRARY_PATHS):
             return False
     return is_outside and threading.current_thread() is not threading.main_thread()
 

@@ -33,7 +33,7 @@ SIGNED = 5
 """Largest number of inputs of which all diagonals are lines."""
 MISSED = 0.25
 """Share of the mean slope that gradients must not miss: half of the error at which an estimate counts as wrong."""
-DRAWS = 512
+SAMPLES = 512
 """Samples of the noise whose costs and gradients must be numbers: an event of 1% is in all but one of 170 such sets."""
 
 
@@ -60,7 +60,7 @@ class Lost(NamedTuple):
 
 
 class Sampled(NamedTuple):
-    """What :data:`DRAWS` samples of the noise show of costs and gradients."""
+    """What :data:`SAMPLES` samples of the noise show of costs and gradients."""
 
     gradients: Lost
     """Samples whose cost is a number, and whose gradient is not."""
@@ -71,11 +71,11 @@ class Sampled(NamedTuple):
 
 def sampled_gradients(problem: Problem, theta: np.ndarray, seed: int, columns: int) -> Sampled:
     """Return what samples of the noise show of costs and gradients at ``theta (d,)``."""
-    w = np.random.default_rng([seed, 0x6C6F7374]).standard_normal((problem.program.n_noise, DRAWS))
+    w = np.random.default_rng([seed, 0x6C6F7374]).standard_normal((problem.program.n_noise, SAMPLES))
     with np.errstate(all="ignore"):
         found = _costs_and_gradients(problem, theta, w, columns)
         variance = float(found[1:].var(axis=1, ddof=1).sum())
-        square = float(np.square(found[1:].mean(axis=1)).sum()) - variance / DRAWS
+        square = float(np.square(found[1:].mean(axis=1)).sum()) - variance / SAMPLES
         spread = math.sqrt(variance / square) if square > 0.0 and math.isfinite(variance) else math.inf
     has_cost, has_gradient = np.isfinite(found[0]), np.isfinite(found[1:]).all(axis=0)
     order = np.argsort(np.linalg.norm(w, axis=0))

@@ -22,7 +22,7 @@ import numpy as np
 
 Z = 1.959963984540054
 """The 0.975 quantile of the standard normal distribution."""
-DRAWS = 1000
+RESAMPLES = 1000
 """Number of resamples per bootstrap interval."""
 
 Interval = tuple[float, float]
@@ -62,7 +62,7 @@ def bootstrap(strata: Sequence[np.ndarray], statistic: Callable[[Sequence[np.nda
     Resamples in which the statistic is NaN are ignored. The interval is NaN if all are. :func:`_tail` gives the quantiles.
     """
     rng = np.random.default_rng(0)
-    drawn = [statistic([part[rng.integers(0, len(part), len(part))] for part in strata]) for _ in range(DRAWS)]
+    drawn = [statistic([part[rng.integers(0, len(part), len(part))] for part in strata]) for _ in range(RESAMPLES)]
     tail = _tail([len(part) for part in strata])
     with warnings.catch_warnings(action="ignore"):  # NaN in all resamples
         low, high = np.nanquantile(drawn, [tail, 1.0 - tail], axis=0, method="nearest")
@@ -86,7 +86,7 @@ def runtime_interval(spent: np.ndarray, reached: np.ndarray) -> Interval:
 
     The upper end is infinite where too many resamples contain no success.
     """
-    drawn = np.random.default_rng(0).integers(0, len(spent), (DRAWS, len(spent)))
+    drawn = np.random.default_rng(0).integers(0, len(spent), (RESAMPLES, len(spent)))
     counts = reached[drawn].sum(axis=1)
     values = np.where(counts > 0, spent[drawn].sum(axis=1) / np.maximum(counts, 1), math.inf)
     tail = _tail([len(spent)])

@@ -30,7 +30,7 @@ MARGIN = 1.0
 """Distance of a moved limit from the last point with a share of the integral, in standard deviations."""
 SHIFTS = {1: ((0.0, 0.5, 0.25, 0.75),), 2: ((0.0, 0.5, 0.25, 0.75), (0.0, 0.25, 0.75, 0.5))}
 """Shift of each rule's panels, as a share of a panel, by number of noise dimensions: no two rules share their points."""
-FIRST = {1: 512, 2: 12}
+COARSEST = {1: 512, 2: 12}
 """Panels per dimension of the coarsest rules, by number of noise dimensions."""
 LEAST = {1: 1 << 15, 2: 1 << 17}
 """Fewest points, by number of noise dimensions. One: 1800 per standard deviation, enough for an event of width .001.
@@ -217,7 +217,7 @@ def _refined(
 
     Raises :class:`_NotFinite`.
     """
-    panels, level = FIRST[integrand.width], None
+    panels, level = COARSEST[integrand.width], None
     while True:
         rules = _rules(edges, panels * stretch)
         if sum(math.prod(axis[0].size for axis in axes) for axes in rules) > points:

@@ -18,7 +18,7 @@ from bench.model import Problem, Program
 
 BATCHES = 64
 """Number of independent batch means that represent a sampled reference."""
-COLUMNS = 4096
+N_COLUMNS = 4096
 """Columns of every evaluated batch, constant so that a compiling backend compiles once, and fewer if ``samples`` is
 small. The pilot, which selects the estimator of a sampled reference, is one batch."""
 LEAST_SAMPLES = 16384
@@ -33,8 +33,7 @@ FAR = 4.5
 """Distance searched for jumps on either side along a direction, in standard deviations."""
 ROUNDING = 1e-9
 """Difference of first and zeroth order, relative to the gradient, that rounding explains."""
-LAST = 100.0
-SHARED = 1e-10
+COMMON_ERROR = 1e-10
 """Relative error common to the terms of all samples, from rounding and central differences."""
 EXTREME = 1e100
 """Size of costs above which, or below the inverse of which, their squares would leave the range of float64."""
@@ -136,7 +135,7 @@ def transferred(reference: Reference, problem: Problem, other: Problem, samples:
     than rounding, and grad J by the mean of difference times score. The upper end of its 95% interval is added to the
     stated error. A reference whose stated error is smaller than that is not transferred.
     """
-    program, theta, columns = problem.program, problem.program.theta0, min(COLUMNS, samples)
+    program, theta, columns = problem.program, problem.program.theta0, min(N_COLUMNS, samples)
     effects, share = [], 0.0
     blocks = max(1, min(samples, LEAST_SAMPLES) // columns)
     for block in range(blocks):
@@ -145,9 +144,9 @@ def transferred(reference: Reference, problem: Problem, other: Problem, samples:
             mine, others = problem.value(theta, w), other.value(theta, w)
             spread = np.ptp(mine[np.isfinite(mine)]) if np.isfinite(mine).any() else 0.0
             # difference between two backends' costs of one draw, relative to the range of costs, that rounding
-            # explains. The root of the coarser unit roundoff is allowed too, and :data:`LAST` roundoffs of the cost
+            # explains. The root of the coarser unit roundoff is allowed too, and 100 roundoffs of the cost
             # itself
-            allowed = max(1e-6, math.sqrt(unit)) * spread + LAST * unit * np.abs(mine)
+            allowed = max(1e-6, math.sqrt(unit)) * spread + 100.0 * unit * np.abs(mine)
             agrees = (mine == others) | (np.abs(others - mine) <= allowed) | (np.isnan(mine) & np.isnan(others))
             share += float(1.0 - agrees.mean()) / blocks
             apart = np.where(agrees, 0.0, others - mine)
@@ -187,7 +186,7 @@ def _compute(
     program = problem.program
     quadrature = None
     if _can_integrate(program):
-        integral = integrate(problem, theta, points, COLUMNS)
+        integral = integrate(problem, theta, points, N_COLUMNS)
         if integral is not None:
             method = f"quadrature[points={integral.points},spacing={integral.spacing:.2g}]"
             quadrature = Reference(
@@ -284,7 +283,7 @@ class _Sampler:
     ) -> None:
         program = problem.program
         self.problem, self.theta, self.samples, self.tolerance = problem, theta, samples, tolerance
-        self.columns = min(COLUMNS, BATCHES * max(1, samples // (4 * BATCHES)))
+        self.columns = min(N_COLUMNS, BATCHES * max(1, samples // (4 * BATCHES)))
         self.centre = problem.value(theta, np.zeros((program.n_noise, 1)))
         self.orders: dict[str, Terms] = {}
         if not program.score_refusal:
@@ -375,7 +374,7 @@ class _Sampler:
                 or f"all samples of the reference have the same gradient: events rarer than {rare:.1g} are not seen"
             )
         # the spread does not show an error that all samples share, such as that of a backend's differences
-        unseen = math.hypot(unseen, SHARED * math.sqrt(float(np.square(self.pilots[order]).sum(axis=0).mean())))
+        unseen = math.hypot(unseen, COMMON_ERROR * math.sqrt(float(np.square(self.pilots[order]).sum(axis=0).mean())))
         return Reference(batches, f"sampling[{order},n={count}]", unseen, note=note, samples=count)
 
     def _cross_checked(self, reference: Reference) -> Reference:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bench.measure.reference import BATCHES, COLUMNS, LEAST_SAMPLES, Reference, doubling_batches, draw_columns
+from bench.measure.reference import BATCHES, LEAST_SAMPLES, N_COLUMNS, Reference, doubling_batches, draw_columns
 from bench.model import Problem, Program, compose
 
 
@@ -46,7 +46,7 @@ def over_ball(problem: Problem, provides: frozenset[str], radius: float, samples
     orders: dict[str, Callable[[np.ndarray], np.ndarray]] = {"zeroth_order": zeroth}
     if program.continuous and "grad" in provides and not program.surrogate:
         orders["first_order"] = first
-    columns = min(COLUMNS, BATCHES * max(1, samples // (4 * BATCHES)))
+    columns = min(N_COLUMNS, BATCHES * max(1, samples // (4 * BATCHES)))
     pilot = draw_columns(problem, "ball pilot", columns, 0)
     spread = {order: float(terms(pilot).var(axis=1).sum()) for order, terms in orders.items()}
     chosen = min(spread, key=lambda order: spread[order] if math.isfinite(spread[order]) else math.inf)

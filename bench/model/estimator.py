@@ -159,8 +159,7 @@ class Estimator(Plugin):
         block = block_of(self.draws, width, count, self.in_units)
         if self.draws == "sobol" and (block < 1 or block & (block - 1) or count % block):
             raise Unsupported(
-                f"Sobol sets have a power of 2 of points: samples={samples} gives sets of {count / (count // max(block, 1)):g}; "
-                f"samples={1 << max(samples, 2 * UNITS - 1).bit_length()} gives a power of 2"
+                f"Sobol sets have a power of 2 of points: samples={samples} has no such sets, samples={1 << max(samples, 2 * UNITS - 1).bit_length()} has"
             )
         if block == 1 < width and self.draws != "iid":
             raise Unsupported(

@@ -17,8 +17,6 @@ from bench.run.files import make_directory, write_whole
 from bench.trace.spikes import MEASURES, align, spikes
 from bench.trace.trace import Trace
 
-DRAWN = 1e30
-"""Magnitude beyond which a diverging quantity is omitted from its panel, but not from the table."""
 SPIKE, TERMINAL = "spike: the largest changes over a step", "terminal cost"
 STYLES = {"": Style("#0072B2", ""), SPIKE: Style("#D55E00", "", width=2.6), TERMINAL: Style("#000000", "o", "none")}
 QUANTITIES = {
@@ -74,7 +72,7 @@ def chart(trace: Trace) -> Chart:
         elif title == "cost":
             notes[title] = f"sum {number(table[['cost_stage', 'cost_terminal']].sum().sum(), 3)}"
     frame = pd.concat(parts, ignore_index=True)
-    frame["value"] = frame["value"].where(frame["value"].abs() < DRAWN)
+    frame["value"] = frame["value"].where(frame["value"].abs() < 1e30)  # a diverging quantity; the table has it
     time = table["time"].to_numpy()
     half = 0.5 * (time[1] - time[0])
     marks = [Mark("in contact", time[i] - half, time[j - 1] + half) for i, j in _runs(table["contacts"])]

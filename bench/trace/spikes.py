@@ -9,10 +9,6 @@ import numpy as np
 
 MEASURES = {"jacobian_norm": "|dF/dx|", "adjoint_norm": "|dL/dx|"}
 """Columns whose spikes are compared with the contact switches, and how they are printed."""
-SPIKE = 3.0
-"""Least factor by which a norm changes over one step at a spike; one stage cost may double an adjoint."""
-TENTH = 0.1
-"""Largest share of the steps that can be spikes: those with the largest changes."""
 LEVEL = 0.05
 """Largest p-value at which spikes count as aligned with switches."""
 
@@ -36,13 +32,13 @@ def changes(values: Sequence[float] | np.ndarray) -> np.ndarray:
 
 
 def spikes(values: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return the steps that are spikes, boolean ``(T,)``: changes above :data:`SPIKE` and among the largest tenth.
+    """Return the steps that are spikes, boolean ``(T,)``: changes by a factor above 3 and among the largest tenth.
 
     In a run of neighbouring steps of this kind only the largest counts: a rise over several steps is one spike.
     """
     steps = changes(values)
-    largest = np.sort(steps)[-max(1, int(TENTH * len(steps)))]
-    high = (steps > np.log(SPIKE)) & (steps >= largest)
+    largest = np.sort(steps)[-max(1, int(0.1 * len(steps)))]
+    high = (steps > np.log(3.0)) & (steps >= largest)  # one stage cost may double a norm
     result = np.zeros(len(steps), dtype=bool)
     for run in np.split(np.arange(len(steps)), np.flatnonzero(np.diff(high.astype(int))) + 1):
         if high[run[0]]:

@@ -41,10 +41,10 @@ if TYPE_CHECKING:
 
 NEUTRAL = 1 + 1e-9
 """Spectral radius, theoretical or measured, up to which a step counts as stable: 1 plus rounding."""
-REACH = np.logspace(-3, 4, 141)
+STIFFNESSES = np.logspace(-3, 4, 141)
 """Values of dt^2 stiffness that the search for the stability limit tries."""
 WORST_FIRST = ("nonfinite", "diverged", "wrong_sign", "zero", "inaccurate", "unresolved", "ok")
-EDGES = {1e-3: "#08519c", 1e-2: "#6baed6", 1e-1: "#d6e6f4", 1.0: "#fdae61", math.inf: "#c51b1b"}
+GRADES = {1e-3: "#08519c", 1e-2: "#6baed6", 1e-1: "#d6e6f4", 1.0: "#fdae61", math.inf: "#c51b1b"}
 """Upper ends of the grades of a relative error, and their colours."""
 OTHER = {
     "near 0": Style("#ffe873", meaning="the gradient is near 0: not judged"),
@@ -54,7 +54,6 @@ OTHER = {
 }
 """Looks of the cells that are neither right nor wrong."""
 CAUSES = ("step", "law", "both", "unknown")
-LIMIT = "stability limit of the step in theory"
 GROWN = "has grown by"
 RESULTS = (
     "verdict",
@@ -386,17 +385,17 @@ def oscillator(cell: Cell) -> tuple[float, float, float] | None:
 
 
 def stiffness_limit(integrator: Integrator, dt: float, damping: float, factor: float) -> float:
-    """Return the stiffness [1/s^2] where the step becomes unstable; 0 if always, inf if nowhere in :data:`REACH`."""
+    """Return the stiffness [1/s^2] where the step becomes unstable; 0 if always, inf if nowhere in :data:`STIFFNESSES`."""
 
     from scipy.optimize import brentq
 
     def excess(reach: float) -> float:
         return spectral_radius(integrator, dt, reach / dt**2, damping, factor) - NEUTRAL
 
-    first = next((i for i, reach in enumerate(REACH) if excess(reach) > 0), None)
+    first = next((i for i, scaled in enumerate(STIFFNESSES) if excess(scaled) > 0), None)
     if first is None:
         return math.inf
-    return float(brentq(excess, *REACH[first - 1 : first + 1])) / dt**2 if first else 0.0
+    return float(brentq(excess, *STIFFNESSES[first - 1 : first + 1])) / dt**2 if first else 0.0
 
 
 # ------------------------------------------------------------------------------------------------- what is shown
@@ -467,11 +466,11 @@ def charts(cells: pd.DataFrame, limit: float) -> list[Chart]:
     frame = frame.iloc[worst.argsort(kind="stable")[::-1]].drop_duplicates(["problem", "dt", "stiffness"]).sort_index()
     frame = frame[frame["problem"] == frame.groupby("step", sort=False)["problem"].transform("first")]
     grades, looks = graded(
-        frame["relative_error"].map(rounded), EDGES, "error {}".format, lambda end: f"{100 * end:g}%"
+        frame["relative_error"].map(rounded), GRADES, "error {}".format, lambda end: f"{100 * end:g}%"
     )
     frame["grade"] = frame["level"].where(frame["level"].isin(OTHER), grades)
     frame["cell"] = [
-        "" if e != e else (f"<{100 * min(EDGES):g}" if e < min(EDGES) else number(100 * e) if e < 10 else ">999")
+        "" if e != e else (f"<{100 * min(GRADES):g}" if e < min(GRADES) else number(100 * e) if e < 10 else ">999")
         for e in frame["relative_error"]
     ]
     found: list[Chart] = []
@@ -494,7 +493,7 @@ def charts(cells: pd.DataFrame, limit: float) -> list[Chart]:
                 panel=panel,
                 cell="cell",
                 limit="stiffness_limit",
-                limit_name=LIMIT,
+                limit_name="stability limit of the step in theory",
                 height=0.16,
                 subtitle=f"{name}. Number: error of the gradient, in % of the true one. Near 0: gradient and error are below {100 * limit:g}% "
                 "of the scene's largest gradient. Beside the limit a small error may be a coincidence of the phase",

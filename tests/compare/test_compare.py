@@ -18,6 +18,7 @@ from helpers import small_rows, unmeasured
 from bench import cli
 from bench.compare import cells, command, history, report, sources, timings
 from bench.experiment.columns import Column, Columns
+from bench.measure.statistics import UNEXPLAINED
 from bench.model import registry
 
 MACHINE = {"processor": "a chip", "cores": 2, "system": "Linux", "load_average": [0.1, 0.1, 0.1]}
@@ -98,6 +99,7 @@ JUDGED = [
             (10.0, {}, "worse", name),
             (0.1, {}, "better", name),
             (10.0, {"reason": "heavy tails"}, "changed", "doubtful"),
+            (10.0, {"reason": UNEXPLAINED}, "changed", UNEXPLAINED),
             (10.0, {"reason": "physics: no wind"}, "worse", name),
             (10.0, {"reason": "physics: no wind; heavy tails"}, "changed", "doubtful"),
         )

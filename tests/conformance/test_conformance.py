@@ -697,37 +697,6 @@ def test_a_wrong_shape_is_named_with_the_file_and_the_shape_of_terms(module, whe
 # ------------------------------------------------------------------------------------------------ abstract plugins
 
 
-def test_scene_without_methods_cannot_be_built():
-    with pytest.raises(TypeError, match=r"abstract.*theta0"):
-        Unfinished()
-    with pytest.raises(TypeError, match=r"abstract.*acceleration.*initial_state.*terminal_cost.*theta0"):
-        type("Unfinished", (MechanicalScene,), {})()
-    with pytest.raises(TypeError, match=r"abstract.*contact_acceleration.*gap.*gap_rate"):
-        type("Unfinished", (ContactScene,), {})()
-
-
-def test_registry_says_which_methods_are_missing(tmp_path):
-    """Found in a folder, an abstract plugin is listed with the reason why it cannot be used."""
-    (tmp_path / "half_done.py").write_text(
-        "from dataclasses import dataclass\n"
-        "from bench.model import FunctionScene\n\n\n"
-        "@dataclass(frozen=True)\n"
-        "class HalfDone(FunctionScene):\n"
-        '    """A cost without a theta."""\n\n'
-        '    name = "half_done"\n\n'
-        "    def cost(self, xp, x):\n"
-        "        return x[0]\n"
-    )
-    (tmp_path / "broken.py").write_text("from bench.model import FunctionScene\nimport no_such_module\n")
-    registry.add_folder(tmp_path)
-    entry = registry.find("scenes", "half_done")
-    assert not entry.available
-    assert entry.reason == "HalfDone does not define theta0"
-    assert "no_such_module" in registry.find("scenes", "broken").reason
-    with pytest.raises(UserError, match=r"scene 'half_done' cannot be used: HalfDone does not define theta0"):
-        registry.make("scenes", "half_done")
-
-
 @pytest.mark.parametrize("base", [MechanicalScene, DoubleIntegrator])
 def test_contacts_without_contact_scene_are_refused_with_the_fix(base):
     with pytest.raises(TypeError, match=r"Touching has n_contacts=1: derive it from ContactScene and define gap"):

@@ -284,6 +284,7 @@ BAD = {
     "name_taken": HEAD.replace('name = "mine"', 'name = "fobg"'),
     "requires_none": HEAD.replace('name = "mine"', 'name = "r1"\n    requires = None'),
     "annotation": HEAD.replace('name = "mine"', 'name = "a1"\n    x: "Nowhere" = 1'),
+    "abstract": HEAD.replace('name = "mine"', 'name = "a2"').replace("def terms", "def others"),
     "kind_odd": HEAD.replace('name = "mine"', 'name = "k1"\n    kind = "a b"'),
 }
 

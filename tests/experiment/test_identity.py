@@ -149,7 +149,9 @@ def test_failed_rows_run_when_they_are_retried_and_unavailable_ones_once_they_ca
         return capsys.readouterr().out
 
     assert main(words) == 0
-    ok = store.load().query("status == 'ok'").iloc[0].drop(COLUMNS.of_kind("list")).to_dict()
+    rows = store.load()
+    assert "at least 4 samples" in rows.query("status == 'unsupported'")["reason"].item()
+    ok = rows.query("status == 'ok'").iloc[0].drop(COLUMNS.of_kind("list")).to_dict()
     store.append(ok | {"status": "error"})
     assert "2 stored, 0 to run" in planned()
     assert "1 stored, 1 to run" in planned("retry=[error]")

@@ -1,10 +1,9 @@
-"""A bias found where none is declared is said to be unexplained: in the row, the tables, the findings, a comparison."""
+"""A bias found where none is declared is said to be unexplained, and what relative columns and variances per sample mean."""
 
 import math
 
 import numpy as np
 import pytest
-from bench.plugins.studies.bias_variance.columns import COLUMNS
 from classes import (
     Cartpole,
     FiniteDifference,
@@ -16,10 +15,8 @@ from classes import (
     Reinforce,
     SemiImplicitEuler,
 )
-from helpers import small_rows
 
-from bench.compare import judging
-from bench.measure.statistics import UNEXPLAINED, Truth, is_unexplained, summarise, variance_per_sample
+from bench.measure.statistics import Truth, is_unexplained, summarise, variance_per_sample
 from bench.model import compose
 
 
@@ -63,30 +60,6 @@ def test_measure_says_so(monkeypatch):
     monkeypatch.setattr("bench.api.make", lambda kind, identity: Off())
     problem = Numpy().compile(compose(Quadratic()))
     assert is_unexplained(bench.estimate(problem, "fobg", samples=16, repeats=16).summary.note)
-
-
-def doubted(rows):
-    """The same rows; those of fobg have a bias that is unexplained."""
-    changed = rows.copy()
-    mine = changed["estimator"] == "fobg"
-    changed.loc[mine, ["bias", "bias_low", "bias_high", "bias_rel", "rmse"]] = [4.0, 3.0, 5.0, 1.0, 4.1]
-    changed.loc[mine, "reason"] = f"declared unbiased, and its interval excludes 0: {UNEXPLAINED}"
-    return changed
-
-
-def test_comparison_says_so():
-    old = small_rows(backends=("jax",), estimators=("fobg",))
-    new = doubted(old)
-    change = of_bias(old, new)
-    assert change.outcome == "changed"
-    assert change.text.endswith(UNEXPLAINED)
-    assert of_bias(old, new.assign(reason="")).outcome == "worse"
-
-
-def of_bias(old, new):
-    """Return the change of the bias between two tables of one row."""
-    changes = judging.judge_cell(COLUMNS, old.iloc[0].to_dict(), new.iloc[0].to_dict())
-    return next(change for change in changes if change.subject == "bias")
 
 
 # ------------------------------------------------------------------------------------------ references near zero

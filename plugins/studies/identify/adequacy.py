@@ -18,7 +18,7 @@ from scipy.fft import dct
 from scipy.linalg import toeplitz
 from scipy.special import chdtri, ndtri, stdtrit
 
-DRAWS = 2000
+SIMULATIONS = 2000
 """Simulated residuals that determine the quantiles."""
 LAGS = 10
 """Lags of the autocorrelations that are tested together."""
@@ -73,16 +73,20 @@ def judge(
     directions = {name: rests[name] / lengths[name] for name in seen}
     # all residuals but the largest have the tails of the noise; their excess kurtosis is about half of that of the noise
     freedom = 4.0 + 3.0 / max(_excess(np.sort(np.abs(residual))[:-1]), 1e-3)
-    noise = np.random.default_rng([seed, 0x61646571]).standard_t(freedom, (DRAWS, m)) * np.sqrt(1.0 - 2.0 / freedom)
+    noise = np.random.default_rng([seed, 0x61646571]).standard_t(freedom, (SIMULATIONS, m)) * np.sqrt(
+        1.0 - 2.0 / freedom
+    )
     noise -= (noise @ basis) @ basis.T
     statistics = _statistics(np.concatenate([residual[None], noise]), directions, channels, free)
     if not is_size_known:
         del statistics["noise"]
     every = np.array(list(statistics.values()))
     # the share of simulated residuals with a larger statistic, for the record and for every simulated one
-    tail = np.array([(DRAWS - np.searchsorted(np.sort(row[1:]), row) + 1.0) / (DRAWS + 1.0) for row in every])
+    tail = np.array(
+        [(SIMULATIONS - np.searchsorted(np.sort(row[1:]), row) + 1.0) / (SIMULATIONS + 1.0) for row in every]
+    )
     least = tail.min(axis=0)
-    probability = float(((least[1:] <= least[0]).sum() + 1.0) / (DRAWS + 1.0))
+    probability = float(((least[1:] <= least[0]).sum() + 1.0) / (SIMULATIONS + 1.0))
     edge = np.quantile(least[1:], LEVEL)
     # in units of the edge of each test, the largest first
     strengths = every[:, 0] / np.quantile(every[:, 1:], 1.0 - edge, axis=1)

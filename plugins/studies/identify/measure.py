@@ -35,7 +35,7 @@ NOISE = 0.01
 """Noise of records that are made from the truth, if none is stated."""
 SHARE = 1e-4
 """Exponents below this are 0."""
-UNEXPLAINED = 1e-3
+REJECTED = 1e-3
 """Share of fits to a right model whose residuals are larger than those that count as consistent with the noise."""
 
 
@@ -239,7 +239,7 @@ def _fit_statistics(fit: Fit, known: Information, is_own: bool) -> dict[str, Any
     square = (fit.residual[:measured] ** 2).sum(axis=0)
     # gaps of multiple shooting tie its initial states to the parameters
     free = max(measured - (fit.fitting.dim if shooting == "windows" else p), 1)
-    has_converged = np.isfinite(square) & (square <= chdtri(free, UNEXPLAINED))
+    has_converged = np.isfinite(square) & (square <= chdtri(free, REJECTED))
     hidden = sum(
         Information(known.names, fit.slopes(i)).rank > known.rank for i in np.flatnonzero(fit.is_finite).tolist()
     )
