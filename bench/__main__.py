@@ -1,6 +1,7 @@
 """``python -m bench``."""
 
 import contextlib
+import gc
 import os
 import select
 import signal
@@ -24,6 +25,7 @@ def command() -> None:
     channel = os.environ.pop(CHANNEL, "")
     if not channel:
         os._exit(_watched())  # without waiting for threads
+    gc.set_threshold(20_000)  # imports and tables make many objects that stay
     from bench.cli import main
     from bench.errors import failure
     from bench.host import guard

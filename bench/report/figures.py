@@ -26,8 +26,12 @@ FONTS = ["DejaVu Sans", "Verdana"]
 """Fonts of one width: the one that texts are measured in, and one that most systems have."""
 UNNEEDED = re.compile(r'<!--.*?-->\s*| *<metadata>.*?</metadata>\s*| id="[\w.]+_\d+"', re.DOTALL)
 """Parts of an SVG that nothing refers to: comments, metadata, and ids that count elements, the same in every figure."""
-METADATA: dict[str, dict[str, Any]] = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
-"""Metadata to omit from each file format, because it would differ between equal figures."""
+OPTIONS: dict[str, dict[str, Any]] = {
+    "png": {"pil_kwargs": {"compress_level": 0}},
+    "svg": {"metadata": {"Date": None}},
+    "pdf": {"metadata": {"CreationDate": None}},
+}
+"""Options of each file format: metadata to omit because it would differ between equal figures, and no compression before the palette."""
 
 
 @contextmanager
@@ -49,7 +53,7 @@ def save(figure: Figure, stem: Path, formats: Sequence[str] = ("png",), data: pd
     contents = {}
     for suffix in formats:
         buffer = io.BytesIO()
-        figure.savefig(buffer, format=suffix, dpi=DPI, metadata=METADATA[suffix])
+        figure.savefig(buffer, format=suffix, dpi=DPI, **OPTIONS[suffix])
         contents[suffix] = _with_palette(buffer) if suffix == "png" else buffer.getvalue()
     if data is not None:
         contents["plotted.csv"] = data.to_csv(index=False, lineterminator="\n", float_format="%.9g").encode()
@@ -69,7 +73,7 @@ def inline_svg(figure: Figure, name: str) -> str:
     title.set_visible(False)
     buffer = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": name, "svg.fonttype": "none", "font.sans-serif": FONTS}):
-        figure.savefig(buffer, format="svg", transparent=True, bbox_inches=below, metadata=METADATA["svg"])
+        figure.savefig(buffer, format="svg", transparent=True, bbox_inches=below, **OPTIONS["svg"])
     drawn = buffer.getvalue().decode()
     drawn = UNNEEDED.sub("", drawn[drawn.index("<svg") :])
     return re.sub(r' width="[^"]*" height="[^"]*"', f' style="--inches: {width:g}"', drawn, count=1)
@@ -84,7 +88,8 @@ def _settle(figure: Figure) -> None:
     if (engine := figure.get_layout_engine()) is not None:
         figure.set_dpi(DPI)
         engine.execute(figure)
-        figure.set_layout_engine("none")
+        with styled():  # an engine, also one that does nothing, would draw the figure a second time
+            figure.set_layout_engine(None)
     for axes in figure.axes:
         axes.set_position(Bbox(axes.get_position(original=True).get_points().round(PLACES)))
 

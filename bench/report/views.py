@@ -128,8 +128,8 @@ def estimator_curves(rows: pd.DataFrame, close: float | None = CLOSE) -> pd.Data
     the label, with the backends where an estimator has several curves.
     """
     rows = attempted(rows).reset_index(drop=True)
-    several = rows["dtype"].nunique() > 1
-    rows = rows.assign(label=estimator_labels(rows), run=rows["backend"] + (" " + rows["dtype"] if several else ""))
+    dtype = " " + rows["dtype"] if rows["dtype"].nunique() > 1 else ""
+    rows = rows.assign(label=estimator_labels(rows), run=rows["backend"] + dtype)
     last = rows[["label", "run", "x"]].drop_duplicates(keep="last").sort_values("x", kind="stable")
     places = last.groupby(["label", "run"]).groups
     met, seconds = rows[["x", "status"]].to_numpy(object), rows["time_s"]
@@ -151,7 +151,8 @@ def estimator_curves(rows: pd.DataFrame, close: float | None = CLOSE) -> pd.Data
             first = next(iter(runs.values()))
             alike = [name for name, run in runs.items() if agree(first, run)]
             times = pd.Series([seconds[runs.pop(name)].median() for name in alike])
-            curves += [(place, len(curves), ", ".join(alike), times[times > 0].min()) for place in first]
+            fastest = times[times > 0].min()
+            curves += [(place, len(curves), ", ".join(alike), fastest) for place in first]
     found = pd.DataFrame(curves, columns=["place", "curve", "backends", "seconds"])
     frame = rows.loc[found.pop("place")].reset_index(drop=True).assign(**found)
     is_only = frame.groupby("label")["curve"].transform("nunique") == 1

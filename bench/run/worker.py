@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import faulthandler
+import gc
 import json
 import os
 import pickle
@@ -53,6 +54,7 @@ def main() -> None:
     # Ctrl-C reaches the run, which ends its workers
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     faulthandler.enable(all_threads=False)
+    gc.set_threshold(20_000)
     sys.argv[:] = ["bench-worker"]
     with suppress(ConnectionLost):
         _serve(Connection(descriptor))

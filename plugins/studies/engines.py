@@ -19,7 +19,6 @@ from bench.measure import noise, timing
 from bench.model import Problem, param, zeroth_order
 from bench.report.style import PALETTE
 from bench.report.text import number
-from bench.report.views import rmse_interval, shown_rmse
 
 from . import PARTS, StudyPackage, against_reference, all_noise, finite_status, relative_error
 from .bias_variance.columns import COLUMNS as ESTIMATES
@@ -238,6 +237,8 @@ def _times(cell: Cell, problem: Problem, study: Engines, has_gradient: bool) -> 
 
 def levels(rows: pd.DataFrame) -> np.ndarray:
     """Return the level of each row's gradient, a key of :data:`LEVELS`."""
+    from bench.report.views import rmse_interval
+
     low, high = rmse_interval(with_variance_interval(rows))
     reach = 2.0 * rows["reference_se"] / rows["reference_norm"]
     low, high = low / (1.0 + reach), (high / (1.0 - reach)).where(reach < 1.0, np.inf)
@@ -259,8 +260,8 @@ def with_variance_interval(rows: pd.DataFrame) -> pd.DataFrame:
     from scipy.special import chdtri
 
     free = np.maximum(rows["repeats"] - 1, 1)
-    ends = {end: chdtri(free, tail) for end, tail in (("low", 0.025), ("high", 0.975))}
-    return rows.assign(**{f"variance_{end}": rows["variance"] * free / value for end, value in ends.items()})
+    sums = rows["variance"] * free
+    return rows.assign(variance_low=sums / chdtri(free, 0.025), variance_high=sums / chdtri(free, 0.975))
 
 
 def with_limits(rows: pd.DataFrame) -> pd.DataFrame:
@@ -268,6 +269,8 @@ def with_limits(rows: pd.DataFrame) -> pd.DataFrame:
 
     The column ``rmse_is_limit`` is true there. Where the interval has no upper end the RMSE is missing.
     """
+    from bench.report.views import shown_rmse
+
     value, *_, is_limit = shown_rmse(with_variance_interval(rows))
     return rows.assign(rmse_is_limit=is_limit, rmse_rel=value)
 

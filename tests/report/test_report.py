@@ -409,8 +409,8 @@ def test_best_is_told_only_where_its_interval_is_apart_from_every_other_estimato
 
 def paper(rows, **settings):
     """The tables of a paper from rows, one per problem."""
-    found = views.arrange(experiment(**settings), with_gradient_cost(rows))
-    return tables.pivots(found, lowest(at_equal_rollouts(method_table(found))))
+    problems = problems_by_axis(views.arrange(experiment(**settings), with_gradient_cost(rows)))
+    return tables.pivots(problems, lowest(at_equal_rollouts(method_table(problems))))
 
 
 def test_the_papers_table_continues_below_and_loses_no_column():
@@ -450,16 +450,13 @@ def test_no_cell_is_lost_where_a_swept_value_is_the_default_of_one_scene(capsys,
     swept, cells = loaded(*FEW, "scenes=[wall_penalty_1d,bouncing_ball]", "sweep.damping=[0,1,10]")
     rows = rows_of(swept, cells)
     shown = views.arrange(swept, rows)
-    along = views.rows_along(shown, named(shown, "damping"))
-    assert sorted(along["x"]) == [0.0, 0.0, 1.0, 1.0, 10.0, 10.0]
+    assert sorted(views.rows_along(shown, named(shown, "damping"))["x"]) == [0.0, 0.0, 1.0, 1.0, 10.0, 10.0]
     assert [sorted(family.rows["x"]) for family in split_by_problem(shown, named(shown, "damping"))] == [
         [0.0, 1.0, 10.0]
     ] * 2
-    found = problems_by_axis(shown)
-    assert [(axis.column, len(family.rows)) for axis, family in found] == [("damping", 3)] * 2
+    assert [(axis.column, len(family.rows)) for axis, family in problems_by_axis(shown)] == [("damping", 3)] * 2
     show(swept, rows)
-    digest = capsys.readouterr().out
-    assert len(re.findall(r"^fobg ", digest, re.MULTILINE)) == 2
+    assert len(re.findall(r"^fobg ", capsys.readouterr().out, re.MULTILINE)) == 2
     chart = next(c for c in swept.study.views(swept, rows).charts if c.name == "bias_variance_damping")
     assert set(chart.frame["x"]) == {0.0, 1.0, 10.0}
 

@@ -14,6 +14,7 @@ from bench.plugins.studies.bias_variance.comparisons import (
     declares,
     lowest,
     method_table,
+    problems_by_axis,
     ratio,
     verdict,
 )
@@ -47,7 +48,7 @@ def cell(error, low, high, **values):
 def made(*cells, **given):
     """Methods and comparisons of cells along the stiffness."""
     rows = with_gradient_cost(table(list(cells)))
-    methods = method_table(arrange(swept(rows, **given), rows))
+    methods = method_table(problems_by_axis(arrange(swept(rows, **given), rows)))
     return methods, compare_errors(at_equal_rollouts(methods))
 
 

@@ -6,6 +6,7 @@ A setting is a problem at one value of its swept axis. A method is an estimator,
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -56,44 +57,45 @@ COLUMNS = (
 )
 """The columns of the table of comparisons."""
 SETTING = ["setting", "problem", "axis", "at", "rollouts"]
+Problems = list[tuple[Axis | None, ProblemRows]]
+"""Problems as curves, each with the axis along which it is reported."""
 ERROR, VALUE, FACTOR = ([f"{name}{end}" for end in ("", "_low", "_high")] for name in ("error", "value", "factor"))
 
 
-def problems_by_axis(shown: Arranged) -> list[tuple[Axis | None, ProblemRows]]:
-    """Return the problems to report, each with the longest axis along which it was swept.
+def problems_by_axis(shown: Arranged) -> Problems:
+    """Return the problems to report as curves, each with the longest axis along which it was swept.
 
     Every cell that ran is in at least one problem. The axis is None for cells that no axis sweeps.
     """
     swept = shown.swept()
-    parts: list[tuple[Axis | None, ProblemRows]] = []
+    parts: Problems = []
     seen: set[str] = set()
     for axis in (*sorted(swept, key=lambda a: -swept[a]), None):
         for group in split_by_problem(shown, axis, ("scene", "contact")):
             cells = attempted(group.rows)
             if set(cells["key"]) - seen and (axis is None or cells["x"].nunique() > 1):
                 seen |= set(cells["key"])
-                parts.append((axis, group))
+                parts.append((axis, replace(group, rows=estimator_curves(group.rows))))
     return parts
 
 
-def method_table(shown: Arranged) -> pd.DataFrame:
+def method_table(problems: Problems) -> pd.DataFrame:
     """Return a line per setting and method: its relative RMSE as measured with a 95% interval, its verdict, and its cost.
 
     The column ``setting`` identifies a setting. ``rollouts`` is the cost of one estimate, a gradient as the rollouts that
     take as long.
     """
     parts = [pd.DataFrame()]
-    for axis, problem in problems_by_axis(shown):
-        rows, title, along = estimator_curves(problem.rows), problem.title(), axis.column if axis else ""
+    for axis, problem in problems:
+        rows, along = problem.rows, axis.column if axis else ""
         error, low, high, is_limit = shown_rmse(rows)
         samples = rows["x"] if along == "samples" else rows["samples"]
-        kinds = {name: str(problem.rows[name].iloc[0]).partition("[")[0] for name in CATEGORIES}
         parts.append(
             pd.DataFrame(
                 {
                     "setting": setting_names(problem, axis, rows),
-                    "problem": title,
-                    **kinds,
+                    "problem": problem.title(),
+                    **{name: str(rows[name].iloc[0]).partition("[")[0] for name in CATEGORIES},
                     "axis": along,
                     "at": rows["x"] if axis else math.nan,
                     "method": rows["method"],
@@ -146,7 +148,7 @@ def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:
     fewest at which most methods are known, and not fewer than the samples of any method take; along samples a setting is a
     number of rollouts, and they are the most.
     """
-    parts = [methods.assign(not_comparable=False)[:0]]
+    parts = [methods.assign(scale=1.0, share=1.0)[:0]]
     for _, level in methods.groupby("setting", sort=False):
         along, problem = level[["axis", "problem"]].iloc[0]
         is_swept = along == "samples"
@@ -165,15 +167,17 @@ def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:
         distances = pd.Series(apart.get(cost), of.index, float).fillna(math.inf)
         nearest = of.loc[distances.groupby(of["method"], sort=False).idxmin()] if apart else level
         scale = (spent / cost).where(of["has_law"]).mask(same[cost], 1.0) if apart else spent
-        found = _scaled(nearest, scale.loc[nearest.index]).assign(rollouts=cost)
-        share = (spent.loc[nearest.index] / cost).where(~found["has_law"] & ~found["has_fixed_work"]).clip(upper=1.0)
-        # power of the rollouts by which an error may fall at most without a law: N^-1.5 for a Sobol set and a smooth
-        # cost. A fitted model may become exact
-        found["error_low"] = found["error_low"] * (share**2.0).fillna(1.0).mask(found["is_fitted"] & (share < 1.0), 0.0)
+        found = nearest.assign(rollouts=cost, scale=scale, share=spent / cost)
         if is_swept:
             found = found.assign(setting=f"{problem}; rollouts {cost:.3g}", axis="rollouts", at=float(f"{cost:.3g}"))
         parts.append(found)
-    return pd.concat(parts).drop_duplicates(["setting", "method"], ignore_index=True)
+    found = pd.concat(parts).drop_duplicates(["setting", "method"], ignore_index=True)
+    found = _scaled(found, found.pop("scale"))
+    share = found.pop("share").where(~found["has_law"] & ~found["has_fixed_work"]).clip(upper=1.0)
+    # power of the rollouts by which an error may fall at most without a law: N^-1.5 for a Sobol set and a smooth
+    # cost. A fitted model may become exact
+    found["error_low"] *= (share**2.0).fillna(1.0).mask(found["is_fitted"] & (share < 1.0), 0.0)
+    return found
 
 
 def _scaled(methods: pd.DataFrame, scale: pd.Series) -> pd.DataFrame:
@@ -183,18 +187,20 @@ def _scaled(methods: pd.DataFrame, scale: pd.Series) -> pd.DataFrame:
     changed["rmse_rel"] = methods["rmse_rel"].where((scale == 1.0) | methods["rmse_rel"].isna(), error)
     is_ok = methods["status"] == "ok"
     *ends, is_limit = shown_rmse(changed)
-    errors = {
-        name: pd.Series(end, methods.index).where(is_ok & scale.notna()) for name, end in zip(ERROR, ends, strict=True)
-    }
-    return changed.assign(**errors, error_is_limit=is_limit, not_comparable=is_ok & scale.isna())
+    return changed.assign(
+        **{n: pd.Series(end, methods.index).where(is_ok & scale.notna()) for n, end in zip(ERROR, ends, strict=True)},
+        error_is_limit=is_limit,
+        not_comparable=is_ok & scale.isna(),
+    )
 
 
 def lowest(equal: pd.DataFrame) -> set[tuple[str, str]]:
     """Return the settings and methods whose interval at equal rollouts lies below that of every other estimator."""
     found = set()
     for setting, level in equal[equal["status"] == "ok"].groupby("setting", sort=False):
-        for row in level[~level["error_is_limit"]].itertuples():
-            rivals = level.loc[level["estimator"] != row.estimator, "error_low"]
+        rows = level.to_records()
+        for row in rows[~rows.error_is_limit]:
+            rivals = rows.error_low[rows.estimator != row.estimator]
             if len(rivals) and (rivals > row.error_high).all():
                 found.add((str(setting), str(row.method)))
     return found
@@ -233,41 +239,41 @@ def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
     first and those tied with it whose error is near.
     """
     names = [*SETTING, "not_comparable", "first", *VALUE, "second", *FACTOR, "tied", "leaders"]
-    used = methods[[*SETTING, "method", "estimator", *ERROR, "error_is_limit", "not_comparable"]]
-    lines = [_compared(level) for _, level in used.groupby("setting", sort=False)]
+    lines = [_compared(level.to_records()) for _, level in methods.groupby("setting", sort=False)]
     return pd.DataFrame(lines, columns=names)
 
 
-def _compared(level: pd.DataFrame) -> dict[str, Any]:
+def _compared(level: np.recarray) -> dict[str, Any]:
     """Return the line of the methods at one setting."""
-    good = level[np.isfinite(level[["error", "error_low"]]).all(axis=1)].sort_values("error", kind="stable")
-    known, missing = good[~good["error_is_limit"]], tuple(level.loc[level["not_comparable"], "method"])
-    lower = good[good["error_is_limit"] & (good["error"] < min(known["error_low"].iloc[:1], default=math.inf))]
+    good = level[np.isfinite(level.error + level.error_low)]
+    good = good[np.argsort(good.error, kind="stable")]
+    known, missing = good[~good.error_is_limit], tuple(level.method[level.not_comparable])
+    lower = good[good.error_is_limit & (good.error < min(known.error_low[:1], default=math.inf))]
     line = {
-        **level.iloc[0][SETTING],
+        **{name: level[name][0] for name in SETTING},
         "not_comparable": missing,
         "first": "",
         "second": "",
         "tied": (),
-        "leaders": tuple(lower["method"]),
+        "leaders": tuple(lower.method),
     }
-    if known.empty or len(lower) or (missing and len(good) == 1):
+    if not len(known) or len(lower) or (missing and len(good) == 1):
         return line | {"tied": line["leaders"]}
-    first, others = known.iloc[0], good.drop(known.index[0])
-    line |= {"first": first["method"], "leaders": (first["method"],), **dict(zip(VALUE, first[ERROR], strict=True))}
-    if others.empty:
+    first, others = known[0], good[good.method != known[0].method]
+    line |= {"first": first.method, "leaders": (first.method,), **dict(zip(VALUE, first[ERROR], strict=True))}
+    if not len(others):
         return line
-    factors = np.array(ratio(first[ERROR], others[ERROR].to_numpy(float).T))
-    factors[0, others["error_is_limit"]] = math.nan
+    factors = np.array(ratio(first[ERROR], [others[name] for name in ERROR]))
+    factors[0, others.error_is_limit] = math.nan
     # the next of another estimator, where there is one
-    second = int(np.argmax(others["estimator"] != first["estimator"]))
+    second = int(np.argmax(others.estimator != first.estimator))
     tied = others[~(factors[1] > 1)]
     # a method whose error is more than this many times the lowest does not share the first place: the order is open
-    near = tied.loc[~(tied["error"] > 2.0 * first["error"]), "method"]
+    near = tied.method[~(tied.error > 2.0 * first.error)]
     line |= {
-        "second": others["method"].iloc[second],
-        "tied": tuple(tied["method"]),
-        "leaders": (first["method"], *near),
+        "second": others.method[second],
+        "tied": tuple(tied.method),
+        "leaders": (first.method, *near),
     }
     return line | dict(zip(FACTOR, factors[:, second], strict=True))
 

@@ -18,7 +18,7 @@ from bench.experiment.parameters import number_problems
 from bench.experiment.views import Table, Views
 from bench.report.problems import ProblemRows
 from bench.report.text import axis_value, counted, number, span
-from bench.report.views import Arranged, arrange, estimator_curves, pareto, shown_rmse
+from bench.report.views import arrange, pareto, shown_rmse
 
 from . import charts, descents, time_to_accuracy, trust
 from .columns import COLUMNS
@@ -29,6 +29,7 @@ from .comparisons import (
     LAW,
     NO_RESULT,
     WORKS,
+    Problems,
     at_equal_rollouts,
     compare_errors,
     lowest,
@@ -49,14 +50,16 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
     rows = rows.assign(trusted=trust.trusted(experiment.results_dir, rows))
     costed = with_gradient_cost(rows)
     shown = arrange(experiment, costed)
-    methods = method_table(shown)
+    problems = problems_by_axis(shown)
+    methods = method_table(problems)
     if methods.empty:
         return None
     equal = at_equal_rollouts(methods)
     errors = compare_errors(equal)
     best = time_to_accuracy.table(shown)
     return Views(
-        tables(experiment, rows, shown, methods, equal, errors, best),
+        tables(experiment, rows, pivots(problems, lowest(equal)), methods, equal, errors, best)
+        + descents.tables(shown),
         charts.charts(shown, equal, best),
         rows=charts.with_plotted_columns(costed),
         columns=[
@@ -103,14 +106,17 @@ ESTIMATOR = text("method", label="estimator")
 def tables(
     experiment: Experiment,
     rows: pd.DataFrame,
-    shown: Arranged,
+    pivoted: list[Table],
     methods: pd.DataFrame,
     equal: pd.DataFrame,
     errors: pd.DataFrame,
     best: pd.DataFrame,
 ) -> list[Table]:
-    """Return all tables; ``equal`` has the methods at equal rollouts, ``best`` is the table of the cost to reach an error."""
-    main, *others = pivots(shown, lowest(equal))
+    """Return the tables of errors, the ``pivoted`` ones first.
+
+    ``equal`` has the methods at equal rollouts, ``best`` is the table of the cost to reach an error.
+    """
+    main, *others = pivoted
     is_ranked = methods["estimator"].nunique() >= LEAST and methods["problem"].nunique() > 1
     names = {name: errors[name].map(", ".join) for name in ("tied", "not_comparable")}
     joined = errors.drop(columns=["setting", "leaders"]).assign(**names)
@@ -125,7 +131,6 @@ def tables(
         Table("verdicts", methods.drop(columns=["setting", "has_law", *LAW]), [], files=["csv"]),
         Table("comparisons", joined.assign(factor_note=limits(joined)), columns, title, COMPARISON_NOTES, data=joined),
         *([] if best.empty else [time_to_accuracy.accuracy_table(best)]),
-        *descents.tables(shown),
     ]
 
 
@@ -140,17 +145,17 @@ COMPARISON_NOTES = (
 # ------------------------------------------------------------------------------------------- along an axis
 
 
-def pivots(shown: Arranged, best: Container[tuple[str, str]]) -> list[Table]:
+def pivots(problems: Problems, best: Container[tuple[str, str]]) -> list[Table]:
     """Return a table per problem: estimators down, values of its longest axis across, each cell a relative RMSE.
 
     Beside them stand the cost and the time of one estimate. ``best`` are the settings and methods in bold.
     """
-    result = [_pivot(axis, problem, best) for axis, problem in problems_by_axis(shown)]
+    result = [_pivot(axis, problem, best) for axis, problem in problems]
     return [*result[:-1], replace(result[-1], notes=_notes(result))]
 
 
 def _pivot(axis: Axis | None, problem: ProblemRows, best: Container[tuple[str, str]]) -> Table:
-    rows = estimator_curves(problem.rows)
+    rows = problem.rows
     ok, note = rows["status"] == "ok", rows["status"].map(lambda status: FAILURES.get(status, [""])[0])
     error, low, high, is_limit = (pd.Series(part, rows.index) for part in shown_rmse(rows))
     error, low, high = (part.where(ok) for part in (error, low, high))
