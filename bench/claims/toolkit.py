@@ -134,10 +134,8 @@ def exact_descent(
     return path[-1], problem.value(points, np.repeat(still, points.shape[1], axis=1))
 
 
-def stochastic_descent(
-    problem: Problem, zeroth: bool, start: float, rate: float, iterations: int, seed: int
-) -> np.ndarray:
-    """Descend on one variable in 20 independent runs. Returns their last points ``(20,)``.
+def stochastic_descent(problem: Problem, zeroth: bool, rate: float, iterations: int, seed: int) -> np.ndarray:
+    """Descend on one variable from 0.1 in 20 independent runs. Returns their last points ``(20,)``.
 
     A step uses the mean of 50 terms of ``fobg`` or, with ``zeroth``, of ``reinforce[baseline=center]``.
     """
@@ -155,5 +153,5 @@ def stochastic_descent(
             values = np.concatenate([method.terms(problem, at[None], w)[0] for at, w in zip(theta, parts, strict=True)])
         return np.asarray(values.reshape(runs, samples).mean(axis=1))
 
-    ends: np.ndarray = descend(step, np.full(runs, start), rate, iterations)[-1]
+    ends: np.ndarray = descend(step, np.full(runs, 0.1), rate, iterations)[-1]
     return ends

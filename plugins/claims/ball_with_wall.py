@@ -79,8 +79,8 @@ class ThrownBall(Claim):
         for text, x in (("0.0257", 0.695), ("0.01665", 0.6), ("4.0e-4", 1.0)):
             (a, a_error), (b, b_error) = mean(0, x), mean(1, x)
             figures.append(Figure(f"bias at {x}", text, abs(a - b), max(a_error, b_error)))
-        first = centre(stochastic_descent(at, False, 0.1, 0.1, 1000, seed=3))
-        zeroth = centre(stochastic_descent(at, True, 0.1, 0.1, 1000, seed=33))
+        first = centre(stochastic_descent(at, False, 0.1, 1000, seed=3))
+        zeroth = centre(stochastic_descent(at, True, 0.1, 1000, seed=33))
         noise = np.random.default_rng(333).standard_normal((1000, 1, RUNS * 50))
         (mixed, off), (_, off_with_baseline) = (_alpha_order_descent(at, noise, baseline) for baseline in (0.0, 1.0))
         code = estimator("alpha_order[gamma=0.01,delta=0.95,sharing=shared]")

@@ -43,8 +43,8 @@ class FallingPivot(Claim):
             figures.append(
                 Figure(f"first-order mean less the gradient at {label}", text, first - truth, error + truth_error)
             )
-        fallen = stochastic_descent(at, False, 0.1, 0.01, 500, seed=4)
-        stopped = stochastic_descent(at, True, 0.1, 0.01, 500, seed=44)
+        fallen = stochastic_descent(at, False, 0.01, 500, seed=4)
+        stopped = stochastic_descent(at, True, 0.01, 500, seed=44)
         figures += [
             Figure("end of the first-order descent", "0.843", *centre(fallen), spread=0.002),
             Figure("cost there", "0.0", float(at.value(fallen[None], np.zeros((1, fallen.size))).max())),

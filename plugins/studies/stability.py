@@ -280,7 +280,7 @@ def _refined(cell: Cell, steps: int) -> Cell:
     return fine
 
 
-def _gradient_at(cell: Cell, steps: int, span: float = 0.0) -> np.ndarray:
+def _gradient_at(cell: Cell, steps: int, span: float) -> np.ndarray:
     """Return the cell's gradient ``(d,)`` with its duration divided into ``steps`` steps; with a span, central differences.
 
     Gradients are shared by all cells with the same fine program.
