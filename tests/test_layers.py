@@ -29,7 +29,7 @@ LAYERS = [
     ["cli"],
     ["__main__"],
 ]
-"""The rooms of ``bench``, each importing only from those above it in this list."""
+"""The packages of ``bench``, each importing only from those above it in this list."""
 FILES = sorted(BENCH.rglob("*.py"))
 PLUGINS = sorted((ROOT / "plugins").rglob("*.py"))
 
@@ -58,7 +58,7 @@ def _imported(path):
             yield from (f"{base}.{alias.name}" for alias in node.names)
 
 
-def room(name):
+def package(name):
     """``report`` of ``bench.report.tables``; ``__init__`` of a name that ``bench`` itself offers."""
     part = name.split(".")[1] if "." in name else "__init__"
     return part if any(part in layer for layer in LAYERS) else "__init__"
@@ -69,7 +69,7 @@ HEIGHT = {name: index for index, layer in enumerate(LAYERS) for name in layer}
 
 def test_imports_go_down():
     for path in FILES:
-        own = room(module_of(path)) if path.parent != BENCH else path.stem
+        own = package(module_of(path)) if path.parent != BENCH else path.stem
         assert own in HEIGHT, f"say in LAYERS where bench/{own} belongs"
         check_imports(path, own)
 
@@ -78,7 +78,7 @@ def check_imports(path, own):
     for name in imported(path):
         assert name.partition(".")[0] != "plugins", f"bench knows no plugin by name, and {path} imports {name}"
         if name.partition(".")[0] == "bench":
-            there = room(name)
+            there = package(name)
             if there == "plugins":
                 assert own == "plugins", f"bench knows no plugin by name, and {path} imports {name}"
             assert there == own or HEIGHT[there] < HEIGHT[own], (
@@ -102,7 +102,7 @@ def test_no_modules_import_each_other_in_a_circle():
 
 
 TOPS = {"studies": "report"}
-"""Kinds of plugins that stand on more than the contracts, and the highest room that they import."""
+"""Kinds of plugins that stand on more than the contracts, and the highest package that they import."""
 
 
 def test_plugins_import_only_public_names():
@@ -110,7 +110,7 @@ def test_plugins_import_only_public_names():
         kind = path.relative_to(ROOT / "plugins").parts[0]
         if kind in TOPS and name.partition(".")[0] == "bench":
             own = name.startswith(f"bench.plugins.{kind}")
-            assert own or (room(name) != "plugins" and HEIGHT[room(name)] <= HEIGHT[TOPS[kind]]), (
+            assert own or (package(name) != "plugins" and HEIGHT[package(name)] <= HEIGHT[TOPS[kind]]), (
                 f"{path} imports {name}"
             )
         elif name.startswith("bench.plugins"):

@@ -1,6 +1,6 @@
-"""Count the Python tokens of each room, without comments and docstrings: ``python validation/size.py [--lower]``.
+"""Count the Python tokens of each package, without comments and docstrings: ``python validation/size.py [--lower]``.
 
-A room is paths with one purpose, in ``validation/size.json``: why it is there, the tokens that it should have (``goal``)
+A package is paths with one purpose, in ``validation/size.json``: why it is there, the tokens that it should have (``goal``)
 and those that it may have (``ceiling``). Fails above a ceiling; ``--lower`` lowers the ceilings to the present counts. One is
 raised by hand, with a sentence in the changelog.
 """
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-ROOMS = Path(__file__).with_suffix(".json")
+BUDGETS = Path(__file__).with_suffix(".json")
 FOLDERS = ("bench", "plugins", "tests", "validation", "docs", "examples")
 LAYOUT = {tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.COMMENT, tokenize.ENDMARKER}
 
@@ -35,9 +35,9 @@ def _is_text(node: ast.expr) -> bool:
     return isinstance(node, ast.Constant) and isinstance(node.value, str)
 
 
-def counts(rooms: dict[str, Any]) -> Counter[str]:
-    """Return the tokens of each room; a file belongs to the longest path of a room that begins its own."""
-    owners = {path: name for name, room in rooms.items() for path in room["holds"].split()}
+def counts(packages: dict[str, Any]) -> Counter[str]:
+    """Return the tokens of each package; a file belongs to the longest path of a package that begins its own."""
+    owners = {path: name for name, package in packages.items() for path in package["holds"].split()}
     result: Counter[str] = Counter()
     for path in (path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")):
         relative = path.relative_to(ROOT)
@@ -47,19 +47,19 @@ def counts(rooms: dict[str, Any]) -> Counter[str]:
 
 
 def main() -> int:
-    """Print each room with its tokens, its ceiling and how far it is from its goal; return 1 if one is above its ceiling."""
-    rooms = json.loads(ROOMS.read_text())
-    present = counts(rooms)
+    """Print each package with its tokens, its ceiling and how far it is from its goal; return 1 if one is above its ceiling."""
+    packages = json.loads(BUDGETS.read_text())
+    present = counts(packages)
     if "--lower" in sys.argv:
-        for name, room in rooms.items():
-            room["ceiling"] = min(present[name], room["ceiling"])
-        ROOMS.write_text(json.dumps(rooms, indent=1) + "\n")
-    above = {name for name, room in rooms.items() if present[name] > room["ceiling"]}
-    print(f"{'room':12}{'tokens':>9}{'ceiling':>9}{'to goal':>9}  why")
-    for name, room in rooms.items():
-        far = min(0, room["goal"] - present[name])
+        for name, package in packages.items():
+            package["ceiling"] = min(present[name], package["ceiling"])
+        BUDGETS.write_text(json.dumps(packages, indent=1) + "\n")
+    above = {name for name, package in packages.items() if present[name] > package["ceiling"]}
+    print(f"{'package':12}{'tokens':>9}{'ceiling':>9}{'to goal':>9}  why")
+    for name, package in packages.items():
+        far = min(0, package["goal"] - present[name])
         mark = "ABOVE ITS CEILING: " * (name in above)
-        print(f"{name:12}{present[name]:9,}{room['ceiling']:9,}{far:9,}  {mark}{room['why']}")
+        print(f"{name:12}{present[name]:9,}{package['ceiling']:9,}{far:9,}  {mark}{package['why']}")
     print(f"{'all':12}{present.total():9,}")
     return int(bool(above))
 
