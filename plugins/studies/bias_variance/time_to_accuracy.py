@@ -12,6 +12,7 @@ import pandas as pd
 
 from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, interval, text
+from bench.experiment.parameters import PROBLEM, VIEWS
 from bench.experiment.views import Table
 from bench.measure.statistics import ends, is_unexplained
 from bench.model import registry
@@ -21,19 +22,6 @@ from bench.report.views import Arranged, estimator_curves, shown_rmse
 
 TIME, ROLLOUTS = "time_s", "rollouts_"
 """Columns with the costs of an estimate: seconds, and rollouts with a gradient at its measured cost."""
-PROGRAM = (
-    "scene",
-    "contact",
-    "integrator",
-    "noise",
-    "horizon",
-    "dt",
-    "stiffness",
-    "sigma",
-    "smoothing",
-    "backend",
-    "dtype",
-)
 
 
 def with_gradient_cost(rows: pd.DataFrame) -> pd.DataFrame:
@@ -42,7 +30,7 @@ def with_gradient_cost(rows: pd.DataFrame) -> pd.DataFrame:
     The ratio is seconds per gradient over seconds per rollout, per program and backend, from the fastest row that uses only
     gradients and the fastest that uses only rollouts, at the largest number of samples with both.
     """
-    program = rows.groupby([name for name in PROGRAM if name in rows], dropna=False).ngroup()
+    program = rows.groupby([name for name in (*PROBLEM, *VIEWS, "backend") if name in rows], dropna=False).ngroup()
     known = rows[(rows["status"] == "ok") & (rows["time_s"] > 0)]
     gradients, rollouts = known["gradients"], known["rollouts"]
 
