@@ -15,7 +15,7 @@ from bench.host.parameters import remember
 
 FOLDER = "BENCH_ENGINES"
 """Environment variable with the folder that contains the environments."""
-VERSIONS = """
+PRINT_VERSIONS = """
 import importlib.metadata, json, platform, sys
 found = {"python": platform.python_version()}
 for name in sys.argv[1:]:
@@ -46,7 +46,7 @@ def library_versions(python: str, libraries: tuple[str, ...]) -> dict[str, str]:
 
     Raises :class:`Unavailable` if it is not a Python.
     """
-    words = [python, "-I", "-c", VERSIONS, *libraries]
+    words = [python, "-I", "-c", PRINT_VERSIONS, *libraries]
     try:
         # seconds allowed for a Python to state its versions
         done = subprocess.run(words, capture_output=True, timeout=60.0, stdin=subprocess.DEVNULL)

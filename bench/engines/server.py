@@ -33,7 +33,7 @@ import numpy as np
 
 KEPT = 4
 """Number of models that a server stores."""
-SETTINGS = ("OMP_NUM_THREADS", "XLA_FLAGS", "JAX_PLATFORMS", "CUDA_VISIBLE_DEVICES")
+VARIABLES = ("OMP_NUM_THREADS", "XLA_FLAGS", "JAX_PLATFORMS", "CUDA_VISIBLE_DEVICES")
 """Environment variables that can change an engine's last digits."""
 
 
@@ -136,9 +136,9 @@ def serve(file: str, requests: Connection) -> None:
 
 
 def _settings(model: Any) -> dict[str, str]:
-    """Return the number of processors, the variables of :data:`SETTINGS` that are set, and the model's own settings."""
+    """Return the number of processors, the variables of :data:`VARIABLES` that are set, and the model's own settings."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    given = {name: os.environ[name] for name in SETTINGS if name in os.environ}
+    given = {name: os.environ[name] for name in VARIABLES if name in os.environ}
     return {"processors": str(count), **given, **{k: str(v) for k, v in getattr(model, "settings", {}).items()}}
 
 

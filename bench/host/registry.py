@@ -44,7 +44,7 @@ KINDS = (
     "studies",
 )
 """The built-in kinds, in listing order. A plugin may declare another kind."""
-NOT_PLUGINS = ("engines", "robots")
+OTHER_PACKAGES = ("engines", "robots")
 """Names of the folders with files that only the Pythons of engines import, and with models of robots."""
 NAME = re.compile(r"\w[\w.-]*")
 """Pattern of plugin names. Brackets, commas and spaces are syntax of identity strings, so names contain none."""
@@ -184,7 +184,7 @@ def _modules(package: ModuleType) -> Iterator[tuple[str, str]]:
         full = f"{package.__name__}.{name}"
         # a folder of plugins need not have an __init__.py
         is_folder = path.is_dir() and name.isidentifier() and not is_package and any(path.glob("*.py"))
-        if name in NOT_PLUGINS or name == "__init__" or "." in name:
+        if name in OTHER_PACKAGES or name == "__init__" or "." in name:
             continue
         if is_folder or (is_package and name in KINDS):
             for module in pkgutil.iter_modules(importlib.import_module(full).__path__):
