@@ -142,12 +142,10 @@ def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]
     """
     session.compilations.restart()
     program = cell.program()
-    theta = program.theta0
     truth = session.references.of(cell)
     problem = session.problem(cell)
-    estimates = CellEstimates(cell, problem, theta)
+    estimates = CellEstimates(cell, problem, program.theta0)
 
-    timing.reset_peak_memory()
     calls = (cell.repeats if cell.backend.compiles else min(study.timed_calls, cell.repeats)) if cell.timing else 0
     # count only the estimates: the reference may have used the same problem
     problem.reset_usage()
@@ -155,6 +153,7 @@ def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]
     parts: list[np.ndarray] = []
     clock, usage, n_counted = timing.Timing(math.nan, math.nan), problem.usage, cell.repeats
     if calls:
+        timing.reset_peak_memory()
         parts, clock = timing.timed(
             lambda r: estimates.of(r, r + 1), calls, settle_s=study.settle_s, pause=estimates.pause
         )
@@ -171,22 +170,23 @@ def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]
         "time_s": clock.median_s,
         "time_iqr_s": clock.iqr_s,
         "time_samples": list(clock.samples_s),
-        "noise_s": noise.seconds(cell.seed, cell.scene.name, cell.samples, program.n_noise, estimates.design)
-        if calls
-        else math.nan,
         "estimates_s": elapsed,
         "compile_s": session.compilations.seconds - compiled_s or math.nan,
         "rollouts": usage.rollouts / n_counted,
         "gradients": usage.gradients / n_counted,
-        "peak_memory_mb": timing.peak_memory_mb(),
         "device": problem.device,
         "compilations": session.compilations.made,
         "shapes": " ".join(sorted(session.compilations.shapes)),
-        "point": theta.tolist(),
+        "point": program.theta0.tolist(),
         "mean_estimate": values.mean(axis=0).tolist(),
         "reference_gradient": truth.gradient.tolist(),
         "auxiliaries": auxiliaries,
     }
+    if calls:
+        result |= {
+            "noise_s": noise.seconds(cell.seed, cell.scene.name, cell.samples, program.n_noise, estimates.design),
+            "peak_memory_mb": timing.peak_memory_mb(),
+        }
     if "value" in cell.estimator.needs:
         result |= costs_of(problem, next(estimates.parts(0)))
     if cell.point is not None:
