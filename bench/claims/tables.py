@@ -74,7 +74,10 @@ def chart(claim: type[Claim], result: ClaimResult) -> Chart | None:
         with np.errstate(all="ignore"):
             height = values[0].to_numpy()
             height = np.log(height) if is_log["y"] else height
-        if any(np.isclose(height, other, rtol=0.0, atol=0.01 * np.ptp(other)).mean() > 0.5 for other in drawn):
+        if any(
+            np.isclose(height, other, rtol=0.0, atol=0.01 * (np.nanmax(other) - np.nanmin(other))).mean() > 0.5
+            for other in drawn
+        ):
             styles[label] = Style("#D55E00", "", (0, (2, 2)))  # both of two lines on top of each other are seen
         drawn.append(height)
         if estimator := ESTIMATORS.get(re.split(r"\W", label)[0]):

@@ -15,7 +15,7 @@ from bench.compare.cells import rows_by_cell
 from bench.compare.judging import ROUNDING, distance, rule_of
 from bench.compare.sources import Results, read_results
 from bench.errors import UserError, local_path
-from bench.experiment.columns import Column, text
+from bench.experiment.columns import Column, setting, text
 from bench.experiment.views import Chart, Mark, Table, Views
 from bench.experiment.words import parse_words
 from bench.run.files import make_directory, write_all
@@ -154,7 +154,7 @@ def views(history: History) -> Views:
         text("series"),
         replace(ERROR, label="error"),
         text("column", label="error of"),
-        Column("cells", format="setting"),
+        setting("cells"),
         Column("moved", label="gradient moved"),
         text("failures", label="failed"),
     ]

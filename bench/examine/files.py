@@ -61,7 +61,7 @@ def charts(report: Findings) -> list[Chart]:
                 [Column("error", label="relative error of the gradient", log=True)],
                 series="derivative",
                 title="The gradient against differences of the cost",
-                text="Falls with the step squared until rounding where the gradient is right; levels off where it is wrong.",
+                subtitle="falls with the step squared until rounding where the gradient is right; levels off where it is wrong",
             )
         )
     if report.lines:

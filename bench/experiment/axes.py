@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -36,6 +37,8 @@ class Axis:
     column: str
     names: tuple[str, ...]
     unit: str = ""
+    doc: str = ""
+    """What it is, in a few words."""
     moves: tuple[str, ...] = ()
     """Columns of the axes that step together with this axis (a zip)."""
 
@@ -101,7 +104,7 @@ def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
         clash = bool((sum(given) > 1).any())
         for part in [[name] for name in members] if clash else [members]:
             column = part[0] if clash else own_name
-            axis = Axis(column, tuple(part), _unit(part, rows))
+            axis = Axis(column, tuple(part), *_declared(part, rows))
             values = values_of(axis, rows)
             is_known = np.isfinite(values)
             if not is_known.any():
@@ -141,11 +144,12 @@ def _zipped_names(sweep: Mapping[str, Any]) -> list[frozenset[str]]:
     return groups
 
 
-def _unit(names: Sequence[str], rows: pd.DataFrame) -> str:
-    """Return the unit of a parameter, as its plugins declare it; empty if their units differ."""
+def _declared(names: Sequence[str], rows: pd.DataFrame) -> tuple[str, str]:
+    """Return the unit of a parameter and its first words, as its plugins declare them; empty where they differ."""
     plugins = [(plugin_class(part, plugin), parameter) for part, plugin, parameter in named(rows, names)]
-    units = {parameters(plugin)[name].unit for plugin, name in plugins if plugin and name in parameters(plugin)}
-    return units.pop() if len(units) == 1 else ""
+    given = [parameters(plugin)[name] for plugin, name in plugins if plugin and name in parameters(plugin)]
+    units, docs = {one.unit for one in given}, {re.split("[,;:]", one.doc)[0] for one in given}
+    return units.pop() if len(units) == 1 else "", docs.pop() if len(docs) == 1 else ""
 
 
 def with_axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> pd.DataFrame:

@@ -127,6 +127,11 @@ def exact(name: str, doc: str, called: str, label: str = "", **more: Any) -> Col
     return Column(name, doc, comparison=ComparisonRule("exact", called), label=label, **more)
 
 
+def setting(name: str, doc: str = "", unit: str = "", **more: Any) -> Column:
+    """Return a column of chosen numbers and counts, which tables print in full."""
+    return Column(name, doc, unit, format="setting", **more)
+
+
 def seconds(name: str, doc: str, label: str = "", **more: Any) -> Column:
     """Return a column of measured times."""
     return Column(name, doc, "s", measured=True, label=label, format="seconds", **more)
@@ -156,25 +161,25 @@ FIRST = (
     text("estimator", "name of the estimator"),
     text("estimator_params", "parameters of the estimator that differ from their defaults"),
     text("noise", "what the noise perturbs: `parameter` (theta) or `action`"),
-    Column("horizon", "number of time steps T", "steps", format="setting"),
-    Column("dt", "length of a time step", "s", format="setting"),
-    Column("stiffness", "stiffness of the contact law, or of the scene without one", "N/m", format="setting"),
-    Column("sigma", "standard deviation of the noise in J", format="setting"),
-    Column("smoothing", "smoothing parameter of the contact law: beta, kappa", format="setting"),
+    setting("horizon", "number of time steps T", "steps"),
+    setting("dt", "length of a time step", "s"),
+    setting("stiffness", "stiffness of the contact law, or of the scene without one", "N/m"),
+    setting("sigma", "standard deviation of the noise in J"),
+    setting("smoothing", "smoothing parameter of the contact law: beta, kappa"),
     Column(
         "descent",
         "share of a descent from theta0 that is done where the gradient is taken",
         format="setting",
         default=0.0,
     ),
-    Column("samples", "samples N in one estimate", format="setting"),
-    Column("repeats", "independent estimates R that measure bias and variance", format="setting"),
-    Column("seed", "seed of the noise", format="setting"),
+    setting("samples", "samples N in one estimate"),
+    setting("repeats", "independent estimates R that measure bias and variance"),
+    setting("seed", "seed of the noise"),
     text("dtype", "floating-point type of the simulation"),
 )
 IDENTITY = tuple(column.name for column in FIRST[1:])
 """The columns that show which cell a row is. The cell's whole identity is in ``parameters``."""
-DIM = Column("dim", "length d of theta", format="setting")
+DIM = setting("dim", "length d of theta")
 STATUS = (
     text("status", "ok, or how the cell failed"),
     text("reason", "reason of a failure, or a remark about the numbers"),
@@ -185,7 +190,7 @@ LAST = (
 )
 DRAWS = (
     text("draws", "points of the noise of an estimate: iid, orthogonal or sobol", default="iid"),
-    Column("mirrored", "1 if each draw w of the noise is followed by -w", format="setting", default=0.0),
+    setting("mirrored", "1 if each draw w of the noise is followed by -w", default=0.0),
 )
 HIDDEN = (
     *(replace(column, table=False) for column in DRAWS),

@@ -74,10 +74,8 @@ class Chart:
     limit: str = ""
     """The column with a value of y per x, drawn as a line on a ``grid``, and named ``limit_name``."""
     limit_name: str = ""
-    text: str = ""
-    """How to read the chart, for the page."""
     subtitle: str = ""
-    """Conditions that all panels share."""
+    """Conditions that all panels share, and how to read them."""
     panel_notes: Mapping[str, str] = field(default_factory=dict)
     """Words below the title of a panel, such as a verdict, by panel."""
     styles: Mapping[str, Style] = field(default_factory=dict)
@@ -93,7 +91,7 @@ class Chart:
     across: int = 4
     """Most panels side by side."""
     height: float = 2.3
-    """Height of a panel in inches; of a row of dots or cells, in ``dots`` and ``grid``, if below 1."""
+    """Height of a panel of ``lines`` or ``points`` in inches."""
     steps: bool = False
     """Whether lines are steps: each value holds up to the next one."""
     band: bool = False
@@ -125,8 +123,8 @@ class Table:
     """The stem of the files' names."""
     frame: pd.DataFrame
     """A line per entry, numbers with all digits. Columns that ``columns`` does not name are only in the CSV."""
-    columns: Sequence[Column]
-    """The columns for readers, in order."""
+    columns: Sequence[Column] = ()
+    """The columns for readers, in order; without any the table is for programs only, a CSV."""
     title: str = ""
     notes: Sequence[str] = ()
     """Paragraphs below the table."""

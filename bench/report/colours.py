@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
 from functools import cache
 from itertools import count
 
@@ -31,11 +30,6 @@ def looks_by_name(charts: Sequence[Chart]) -> dict[str, Style]:
     others = (name for name in dict.fromkeys(drawn) if name not in given)
     found = given | {name: _look(place) for name, place in zip(others, free, strict=False)}
     return {name: style for name, style in found.items() if name in drawn}
-
-
-def nested(names: Sequence[str]) -> dict[str, Style]:
-    """Return looks in which lines and points on top of each other are all seen: each later one is thinner and smaller."""
-    return {name: replace(_look(i), width=1.2 * (len(names) - i)) for i, name in enumerate(names)}
 
 
 def _look(place: int) -> Style:

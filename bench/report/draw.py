@@ -19,11 +19,13 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FixedLocator
+from matplotlib.transforms import ScaledTranslation
 
 from bench.experiment.columns import Column
 from bench.experiment.views import Chart, Style
 from bench.report.colours import looks_by_name
 from bench.report.names import in_words
+from bench.report.problems import value_text
 from bench.report.scales import LARGEST, SMALLEST, log_axis
 from bench.report.style import GREY, MARKS, SHADE, SIZE, filled, plain, width_in_inches
 from bench.report.text import axis_value, number, short_duration
@@ -39,6 +41,8 @@ BOLD = 1.3
 """Width of a bold title relative to the same text elsewhere."""
 UPWARDS = (1.0, 1.6, 2.4, 3.2, math.inf)
 """Lengths in inches of labels that read upwards, the first that fits."""
+ROW = 0.22
+"""Least height of a row of dots or cells in inches."""
 DOT = 0.075
 """Height in inches of a series in a row of dots."""
 BELOW = 0.35
@@ -49,6 +53,8 @@ USELESS = 1e2
 """Where a value above 1 means a failure, larger values are drawn here with their number."""
 CUT = SIZE + 1
 """Height of the line of such a number, in points."""
+BESIDE = 2.5
+"""Distance in points of the marks of a panel's lines at the same place."""
 HOLLOW: dict[str, Any] = {"markerfacecolor": "none"}
 NEAR = 20.0
 """Distance from which an arrow joins two points, in hundredths of an inch."""
@@ -89,9 +95,7 @@ def draw(chart: Chart, is_narrow: bool = False) -> Figure:
     written = [text for names in labels for text in names]
     inner = (width - beside * (0.85 if is_plot else max(map(_text_width, written), default=0.0))) / across - 0.12
     is_spread = chart.kind == "dots" and not chart.join and chart.series not in ("", chart.y[0].name)
-    row = max(
-        [chart.height, DOT * len(styles) * is_spread, *(LINE * (1 + text.count("\n")) + 0.015 for text in written)]
-    )
+    row = max([ROW, DOT * len(styles) * is_spread, *(LINE * (1 + text.count("\n")) + 0.015 for text in written)])
     heights = [
         (chart.height if is_plot else row * len(names) + 0.1) * (1.0 if y is chart.y[0] else BELOW)
         for names, (*_, y) in zip(rows, panels, strict=True)
@@ -263,7 +267,7 @@ def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[float] = ()) 
     ends = rows[[name for name in (column.low, column.high) if name]].to_numpy(float).ravel()
     ends = ends[np.isfinite(ends) & (ends >= low / 100) & (ends <= (USELESS if column.above_one else high * 100))]
     every = [low, high, *ends, *(at for at in marks if at > 0)]
-    margin = max((max(every) / min(every)) ** 0.06, 1.15)
+    margin = max((max(every) / min(every)) ** 0.08, 1.15)
     return min(every) / margin, max(every) * margin
 
 
@@ -290,12 +294,15 @@ def _draw_marks(chart: Chart, panel: Axes, name: str) -> None:
 def _draw_lines(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], y: Column, log: bool) -> None:
     x = chart.x[0]
     keys = [key for key in dict.fromkeys((chart.series, chart.line)) if key]
-    for order, (key, points) in enumerate(part.groupby(keys, sort=False) if keys else [(("",), part)]):
+    groups = [*part.groupby(keys, sort=False)] if keys else [(("",), part)]
+    for order, (key, points) in enumerate(groups):
         style = styles[str(key[0]) if chart.series else ""]
         is_line, is_number = chart.kind == "lines", pd.api.types.is_numeric_dtype(points[x.name])
         points = points.sort_values(x.name, kind="stable") if is_line and is_number else points
         mark = style.marker if not is_line or len(points) <= MANY or style.line == "none" else ""
-        _draw_values(chart, panel, points, y, log, points[x.name].to_numpy(), style, mark, 3 + 0.01 * order)
+        # marks on top of each other are all seen
+        shift = BESIDE * (order - (len(groups) - 1) / 2) * (is_line and not chart.line and mark != "")
+        _draw_values(chart, panel, points, y, log, points[x.name].to_numpy(), style, mark, shift)
 
 
 def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style]) -> None:
@@ -320,9 +327,12 @@ def _draw_values(
     places: np.ndarray,
     style: Style,
     marker: str,
-    zorder: float,
+    shift: float = 0.0,
 ) -> None:
-    """Draw the values of a column at ``places`` of the other axis, with intervals; limits are hollow, failures crosses at the edge."""
+    """Draw the values of a column at ``places`` of the other axis, with intervals, ``shift`` points to the right.
+
+    Limits are hollow, failures crosses at the edge, and so are arrows to values beyond it, to which lines lead.
+    """
     values = points[column.name].to_numpy(float)
     limit, lost = (
         points[name].to_numpy(bool) if name else np.zeros(len(points), bool) for name in (column.limit, chart.failed)
@@ -332,19 +342,22 @@ def _draw_values(
     if log:  # what has no logarithm is an upper limit too, at the least value that has one
         every = chart.frame[column.name]
         limit = (limit | (values <= column.least)) & ~lost
-        values = values.clip(column.least or every[every > 0].min(), most)
+        values = values.clip(column.least or every[every > 0].min())
     is_flat = chart.kind == "dots"
+    aside = ScaledTranslation(shift / 72, 0.0, panel.figure.dpi_scale_trans)
     edge = panel.get_yaxis_transform() if is_flat else panel.get_xaxis_transform()
-    look: dict[str, Any] = {"color": style.colour, "zorder": zorder}
+    look: dict[str, Any] = {"color": style.colour, "zorder": 3}
 
     def plot(at: Any, value: Any, **more: Any) -> None:
-        panel.plot(*((value, at) if is_flat else (at, value)), **look | more)
+        (line,) = panel.plot(*((value, at) if is_flat else (at, value)), **look | more)
+        line.set_transform(line.get_transform() + aside)
 
     is_hollow, size = limit & bool(marker), 2.55 + 1.5 * style.width
     plot(
         places,
         np.where(is_hollow | lost, math.nan, values),  # no line joins a limit to a value
         marker=marker,
+        markevery=~is_cut,
         linestyle=style.line if chart.kind == "lines" else "none",
         linewidth=style.width,
         markersize=size,
@@ -366,18 +379,22 @@ def _draw_values(
             low, high = (np.where(known, end, np.nan) for end in (low, high))
             panel.fill_between(places, low, high, color=style.colour, alpha=0.18, linewidth=0, zorder=2)
         else:
-            (panel.hlines if is_flat else panel.vlines)(places[known], low[known], high[known], linewidth=1.0, **look)
-    if is_cut.any():  # beside the panel, above the values that were cut before
-        _name(panel, "largest beyond the axis", marker="$\u2191$")
+            bars = panel.hlines if is_flat else panel.vlines
+            ends = bars(places[known], low[known], high[known], linewidth=1.0, **look)
+            ends.set_transform(ends.get_transform() + aside)
+    if is_cut.any():  # numbers are beside the panel, above those that were cut before
+        arrow: dict[str, Any] = {"marker": f"${'→' if is_flat else '↑'}$", "markersize": 7}
+        _name(panel, "beyond the axis, the largest as a number", **arrow)
+        plot(places[is_cut], np.full(is_cut.sum(), 0.96), linestyle="none", transform=edge, **arrow)
         last = int(np.nanargmax(np.where(is_cut, given, np.nan)))
         cuts = [text.get_text() for text in panel.texts if text.get_gid() == "cut"]
-        label = f"{number(given[last])} {'→' if is_flat else '↑'}"
-        at, shift = ((1, places[last]), (2, -3)) if is_flat else ((places[last], 1), (0, 2 + CUT * len(cuts)))
+        label = number(given[last])
+        at, above = ((1, places[last]), (2, -3)) if is_flat else ((places[last], 1), (0, 2 + CUT * len(cuts)))
         if label not in cuts:
             panel.annotate(
                 label,
                 at,
-                shift,
+                above,
                 xycoords=edge,
                 textcoords="offset points",
                 color=style.colour,
@@ -417,7 +434,7 @@ def _draw_dots(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, 
         points = part[part[chart.series].astype(str) == series] if chart.series else part
         shift = -0.75 * (order - (len(styles) - 1) / 2) / max(len(styles), 2) if is_spread else 0.0
         rows = np.array([place[str(v)] for v in points[y.name]]) + shift
-        _draw_values(chart, panel, points, x, log, rows, style, style.marker or "o", 3)
+        _draw_values(chart, panel, points, x, log, rows, style, style.marker or "o")
     panel.grid(axis="y", color="#e4e4e4", linewidth=0.6)
     panel.set_axisbelow(True)
     panel.set_xlabel(plain(x.heading))
@@ -434,7 +451,7 @@ def _draw_grid(
     widest = max(map(width_in_inches, map(str, chart.frame[chart.cell])), default=0.0) if chart.cell else 0.0
     has_text = chart.cell and min(0.8 * 72 * room, SIZE * 0.92 * room / max(widest, 0.1)) >= SIZE - 1
     for line in part.to_dict("records"):
-        at = names.index(_category(line[x.name])), place[_category(line[y.name])]
+        at = names.index(value_text(line[x.name])), place[value_text(line[y.name])]
         face, name = styles[str(line[chart.level])].colour, plain(styles[str(line[chart.level])].meaning)
         panel.add_patch(
             Rectangle((at[0] - 0.5, at[1] - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=0.8, label=name)
@@ -465,16 +482,12 @@ def _draw_grid(
         spine.set_visible(False)
 
 
-def _category(value: Any) -> str:
-    return axis_value(float(value)) if isinstance(value, int | float | np.number) else str(value)
-
-
 def _categories(column: Column, rows: pd.DataFrame, downwards: bool = False) -> list[str]:
     """Return the categories of an axis in order: strings as they appear, numbers increasing, or downwards decreasing."""
     values = rows[column.name].drop_duplicates()
     if pd.api.types.is_numeric_dtype(values):
-        return list(dict.fromkeys(map(_category, sorted(values.dropna(), reverse=downwards))))
-    return list(map(str, values))
+        values = values.dropna().sort_values(ascending=not downwards)
+    return list(dict.fromkeys(map(value_text, values)))
 
 
 def ink_on(ground: str) -> str:

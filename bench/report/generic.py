@@ -7,7 +7,7 @@ from dataclasses import replace
 import pandas as pd
 
 from bench.experiment import axes
-from bench.experiment.columns import COMMON, IDENTITY, Column
+from bench.experiment.columns import COMMON, IDENTITY, Column, setting
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Table, Views
 from bench.report.problems import titled
@@ -28,7 +28,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     table = shown.rows
     own = own_columns(experiment, table)
     labels = [COMMON[name] for name in IDENTITY if table[name].nunique(dropna=False) > 1] or [COMMON["scene"]]
-    swept = [Column(axis.column, label=axis.title, format="setting") for axis in shown.swept()]
+    swept = [setting(axis.column, label=axis.title) for axis in shown.swept()]
     labels = [column for column in labels if column.name not in {axis.name for axis in swept}]
     x = [*swept, *(column for column in labels if column.kind == "number")]
     y = [column for column in own if column.kind == "number"]

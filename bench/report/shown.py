@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from bench.experiment import axes
-from bench.experiment.columns import COMMON, Column
+from bench.experiment.columns import COMMON, Column, setting
 from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import PROBLEM
 from bench.experiment.views import Table
@@ -64,7 +64,7 @@ class Shown:
         rows = self.rows if rows is None else rows
         shown = [self.column(one, digits=3) if isinstance(one, str) else one for one in columns]
         labels = label_columns(self.arranged, self.parts, self.over, always=always, rows=rows)
-        heads = [COMMON.get(name, Column(name, format="setting")) for name in labels]
+        heads = [COMMON.get(name, setting(name)) for name in labels]
         return Table(
             self.experiment.study.name,
             rows,

@@ -24,6 +24,7 @@ STYLE: dict[str, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.linewidth": 0.6,
+    "axes.xmargin": 0.08,
     "lines.linewidth": 1.2,
     "lines.markersize": 4.5,
     "legend.frameon": False,

@@ -104,15 +104,10 @@ def merge_seeds(rows: pd.DataFrame) -> pd.DataFrame:
     return merged.reset_index(drop=True)
 
 
-def estimator_label(estimator: str, params: str) -> str:
-    """Return an estimator's identity string: its name, then its non-default parameters in brackets."""
-    return f"{estimator}[{params}]" if params else estimator
-
-
 def estimator_labels(rows: pd.DataFrame) -> pd.Series:
-    """Return the estimator's identity string of each row."""
-    labels = map(estimator_label, rows["estimator"], rows["estimator_params"])
-    return pd.Series(list(labels), index=rows.index, dtype=object)
+    """Return the estimator's identity string of each row: its name, then its non-default parameters in brackets."""
+    names, params = rows["estimator"], rows["estimator_params"]
+    return names.where(params == "", names + "[" + params + "]")
 
 
 RUN = ("estimator", "estimator_params", "backend", "dtype")

@@ -83,7 +83,7 @@ def table_files(tables: Sequence[Table], experiment: str) -> dict[str, str]:
         "md": lambda: markdown(tables, experiment),
         "tex": lambda: latex([table for table in tables if "tex" in table.files], experiment),
     }
-    return {f"{first.name}.{kind}": makers[kind]() for kind in first.files}
+    return {f"{first.name}.{kind}": makers[kind]() for kind in first.files if first.columns or kind == "csv"}
 
 
 # --------------------------------------------------------------------------------------------------------- files

@@ -43,7 +43,9 @@ class SmoothedPush(Claim):
         "stays near 2,900."
     )
     source = "Suh et al. 2022, ICML"
-    learned = "Smooth contact until its width is that of a sample's motion: then the first order is far better."
+    learned = (
+        "The first order of a smoothed contact has far less variance than the zeroth, until the contact is too sharp."
+    )
     quantity = "variance of one sample"
     logarithmic = "xy"
     quick = False

@@ -259,8 +259,7 @@ def _charts(shown: Shown, good: pd.DataFrame) -> list[Chart]:
             panel="problem",
             across=2,
             title=f"How much {what} does the gradient of a long rollout take?",
-            subtitle=f"Batches of {samples} rollouts on one thread, median of calls",
-            text=f"Little is known below {SMALL:.0f} MiB.",
+            subtitle=f"batches of {samples} rollouts on one thread, median of calls; little is known below {SMALL:.0f} MiB",
         )
         for what, (name, y) in zip(("memory", "time"), drawn.items(), strict=True)
     ]

@@ -290,7 +290,6 @@ def _chart(measured: pd.DataFrame) -> Chart:
         level="level",
         cell="cell",
         styles=LEVELS,
-        height=0.3,
         across=1,
         subtitle="number: relative distance from the model's gradient; rigid: with the law impulse",
         failed_name="not supported",

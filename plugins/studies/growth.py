@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.experiment.cell import Cell
-from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule, bounded, interval, numbers, text
+from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule, bounded, interval, numbers, setting, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Table, Views
@@ -57,7 +57,7 @@ VERDICT = (
     interval("rate", "rate of the best exponential", "1/s"),
     Column("odds", "likelihood of the exponential relative to the power law", label="exponential to power law"),
     text("lower", "the order whose variance is lower beyond doubt", label="lower variance"),
-    Column("zeroth_from", "horizon from which on that is the zeroth order", "s", label="from", format="setting"),
+    setting("zeroth_from", "horizon from which on that is the zeroth order", "s", label="from"),
 )
 """The columns of the table with a line per problem."""
 VERDICT_NOTE = (
@@ -81,7 +81,7 @@ class Growth(StudyPackage):
 
     name = "growth"
     columns = Columns.of(
-        Column("time_horizon", "duration of the rollout", "s", label="horizon", format="setting"),
+        setting("time_horizon", "duration of the rollout", "s", label="horizon"),
         *(
             Column(
                 f"gradient_{name}", f"norm of one sample's gradient, {q:.0%} quantile", **(MEDIAN if q == 0.5 else {})
@@ -206,11 +206,9 @@ class Growth(StudyPackage):
             [shown.column("gradient_median", log=True)],
             panel="problem",
             across=5,
-            height=1.9,
             band=True,
             panel_notes=dict(zip(lines["problem"], lines["verdict"].map(MEANING), strict=True)),
-            subtitle="median over noise samples",
-            text="On these axes a power law is straight and an exponential bends upwards.",
+            subtitle="median over noise samples; on these axes a power law is straight and an exponential bends upwards",
         )
         named = shown.arranged.rows.assign(problem=shown.rows["problem"]).fillna({"problem": ""})
         return Views([answers, cells], [chart], named)

@@ -90,7 +90,6 @@ class Solver(StudyPackage):
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
         """Return the table with a line per scene, engine and iterations, and the chart of errors."""
-        from bench.report.colours import nested
         from bench.report.shown import Shown
 
         shown = Shown(experiment, rows)
@@ -107,7 +106,6 @@ class Solver(StudyPackage):
             [error],
             series="method",
             panel="problem",
-            styles=nested(fewer["method"].unique()),
             marks=[Mark("as large as the gradient", 1.0, axis="y")],
             subtitle=f"against the gradient of the same program after {self.converged} iterations",
         )

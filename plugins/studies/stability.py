@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from bench.experiment.cell import Cell
-from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule, exact, numbers, text
+from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule, exact, numbers, setting, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Style, Table, Views
@@ -68,7 +68,7 @@ RESULTS = (
 SHARES = (
     text("scene"),
     text("step", label="law and integrator"),
-    Column("cells", format="setting"),
+    setting("cells"),
     *(Column(name, format="percent") for name in ("right", "wrong", *OTHER)),
     *(Column(f"by {cause}", label=f"wrong by {cause}", format="percent") for cause in CAUSES),
 )
@@ -163,7 +163,7 @@ class Stability(StudyPackage):
         if cells.empty:
             return None
         found = cells[["error_share", "level"]].reindex(rows.index)
-        whole = Table("stability_map", table(experiment, rows).assign(**found), [], files=["csv"])
+        whole = Table("stability_map", table(experiment, rows).assign(**found))
         shares = Table(
             "stability_shares",
             shares_of(cells),
@@ -452,6 +452,13 @@ def shares_of(cells: pd.DataFrame) -> pd.DataFrame:
     return shares.iloc[order].reset_index(drop=True)
 
 
+SHOWN = {
+    "step": "Each contact law is drawn with the integrator that is most often right",
+    "integrator": "Beside the limit a small error may be a coincidence of the phase",
+}
+"""What the subtitle of a map says of its panels."""
+
+
 def charts(cells: pd.DataFrame, limit: float) -> list[Chart]:
     """Return a map per scene, of the first variant of each law and integrator; of several laws, each with its best integrator."""
     from bench.report.colours import graded
@@ -460,7 +467,8 @@ def charts(cells: pd.DataFrame, limit: float) -> list[Chart]:
 
     every = sorted(cells["stiffness"].dropna().unique()) or [math.nan]
     # a law without stiffness is the same at each one
-    frame = cells.assign(stiffness=[[k] if k == k else every for k in cells["stiffness"]])
+    is_free = cells["stiffness"].isna()
+    frame = cells.assign(stiffness=[[k] if k == k else every for k in cells["stiffness"]], is_free=is_free)
     frame = frame.explode("stiffness", ignore_index=True).astype({"stiffness": float})
     worst = frame["relative_error"].fillna(math.inf).where(frame["level"] != "open", -1.0)
     frame = frame.iloc[worst.argsort(kind="stable")[::-1]].drop_duplicates(["problem", "dt", "stiffness"]).sort_index()
@@ -494,10 +502,9 @@ def charts(cells: pd.DataFrame, limit: float) -> list[Chart]:
                 cell="cell",
                 limit="stiffness_limit",
                 limit_name="stability limit of the step in theory",
-                height=0.16,
+                panel_notes=dict.fromkeys(part.loc[part["is_free"], panel], "the same at any stiffness"),
                 subtitle=f"{name}. Number: error of the gradient, in % of the true one. Near 0: gradient and error are below {100 * limit:g}% "
-                "of the scene's largest gradient. Beside the limit a small error may be a coincidence of the phase",
-                text="The worst where backends disagree. Of several contact laws, each is drawn with the integrator that is most often right.",
+                f"of the scene's largest gradient. The worst of all backends. {SHOWN[panel]}",
             )
         )
     return found

@@ -258,7 +258,6 @@ def _dumbbells(shown: Shown, trapped: pd.DataFrame) -> Chart:
         styles=STYLES,
         join=True,
         across=2,
-        height=0.2,
-        subtitle="at the smallest time step" if shown.over else "",
-        text="The longer the line, the better a wrong gradient passes a check against differences of its own cost.",
+        subtitle="at the smallest time step; " * bool(shown.over)
+        + "the longer the line, the better a wrong gradient passes a check against differences of its own cost",
     )

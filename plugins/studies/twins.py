@@ -144,7 +144,5 @@ class Twins(StudyPackage):
             "dots",
             series="method",
             marks=[Mark("rounding up to here", 1e-6)],
-            height=0.3,
-            text="One dot per problem and engine. Left of the dashed line a difference is accumulated rounding.",
         )
         return Views([cells], [chart])

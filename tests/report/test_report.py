@@ -37,7 +37,7 @@ from bench.experiment.axes import axes
 from bench.experiment.columns import Column, text
 from bench.experiment.views import Chart, Mark, Views
 from bench.report import latex, views, writer
-from bench.report.draw import NARROW, WIDTH, draw
+from bench.report.draw import BESIDE, NARROW, WIDTH, draw
 from bench.report.figures import DPI, save, styled
 from bench.report.problems import split_by_problem
 
@@ -172,10 +172,22 @@ def test_a_value_of_0_is_hollow_and_a_useless_one_a_number_that_stands_outside_i
     ]
     assert hollow == [[FLOOR]]
     assert np.isnan(panel.lines[0].get_ydata()[0])
-    assert [text.get_text() for text in panel.texts] == ["1.0e4 ↑", "1.0e24 ↑"]
+    assert [text.get_text() for text in panel.texts] == ["1.0e4", "1.0e24"]
+    arrows = [line.get_xdata().tolist() for line in panel.lines if line.get_marker() == "$↑$" and len(line.get_xdata())]
+    assert arrows == [[2.0, 3.0], [3.0]]
+    assert panel.lines[0].get_ydata()[-1] == 1e4, "a line leads to a value beyond the axis, and shows no plateau"
     boxes = [text.get_window_extent() for text in panel.texts]
     assert all(box.y0 >= panel.bbox.y1 for box in boxes)
     assert not boxes[0].overlaps(boxes[1])
+
+
+def test_marks_at_the_same_place_are_beside_each_other():
+    """Of lines on top of each other only the last was seen."""
+    frame = pd.DataFrame({"x": [1.0, 2.0, 3.0] * 2, "y": [1.0, 2.0, 3.0] * 2, "name": [*"aaabbb"]})
+    (panel,) = figure_of(Chart("one", frame, [Column("x")], [Column("y")], series="name")).axes
+    first, second = (line.get_transform().transform(line.get_xydata()) for line in panel.lines[:2])
+    assert np.ptp([first[:, 0], second[:, 0]], axis=0) == pytest.approx(BESIDE / 72 * panel.figure.dpi)
+    assert first[:, 1] == pytest.approx(second[:, 1])
 
 
 def test_an_interval_without_an_end_reaches_the_edge():
@@ -384,17 +396,15 @@ def test_fonts_are_inside_the_files_and_dates_are_not(tmp_path):
 
 def test_best_is_told_only_where_its_interval_is_apart_from_every_other_estimator():
     def rows(other):
-        made = [
-            row(estimator=name, backend=backend, gradients=0)
-            for name in ("fobg", "reinforce")
-            for backend in ("jax", "torch")
-        ]
-        known = table(made)
-        known[["bias_low", "bias_high"]] = 0.0
-        ends = {"fobg": (1.0, 2.0), "reinforce": other}
-        for end, place in (("low", 0), ("high", 1)):
-            known[f"variance_{end}"] = [ends[name][place] for name in known["estimator"]]
-        return known.assign(rmse=[1.2 if name == "fobg" else 2.0 for name in known["estimator"]])
+        known = (("fobg", (1.0, 2.0), 1.2), ("reinforce", other, 2.0))
+        ends = {"gradients": 0, "bias_low": 0.0, "bias_high": 0.0}
+        return table(
+            [
+                row(estimator=name, backend=backend, rmse=rmse, variance_low=low, variance_high=high, **ends)
+                for name, (low, high), rmse in known
+                for backend in ("jax", "torch")
+            ]
+        )
 
     def bold(made):
         return [cell for part in paper(made) for cell in part.frame["x0_best"]]
@@ -445,7 +455,7 @@ FEW = ("estimators=[fobg]", "backends=[numpy]")
 
 
 @pytest.mark.slow
-def test_no_cell_is_lost_where_a_swept_value_is_the_default_of_one_scene(capsys, made):
+def test_no_cell_is_lost_where_a_swept_value_is_the_default_of_one_scene():
     """Damping 1 is what wall_penalty_1d asks of its law, and 0 what bouncing_ball leaves it: no identity string shows either."""
     swept, cells = loaded(*FEW, "scenes=[wall_penalty_1d,bouncing_ball]", "sweep.damping=[0,1,10]")
     rows = rows_of(swept, cells)
@@ -454,9 +464,6 @@ def test_no_cell_is_lost_where_a_swept_value_is_the_default_of_one_scene(capsys,
     assert [sorted(family.rows["x"]) for family in split_by_problem(shown, named(shown, "damping"))] == [
         [0.0, 1.0, 10.0]
     ] * 2
-    assert [(axis.column, len(family.rows)) for axis, family in problems_by_axis(shown)] == [("damping", 3)] * 2
-    show(swept, rows)
-    assert len(re.findall(r"^fobg ", capsys.readouterr().out, re.MULTILINE)) == 2
     chart = next(c for c in swept.study.views(swept, rows).charts if c.name == "bias_variance_damping")
     assert set(chart.frame["x"]) == {0.0, 1.0, 10.0}
 

@@ -14,6 +14,7 @@ from trees import ROOT
 
 import bench
 from bench.experiment import config
+from bench.report.draw import draw
 
 PAPER = ROOT / "examples" / "cost_of_error"
 D = 8
@@ -188,9 +189,6 @@ def test_a_verdict_counts_scenes_and_not_problems(scenes, verdict):
     ]
     line = compared(lines, "random error 3 / 0.3")
     assert (line["problems"], line["scenes"], line["above"], line["verdict"]) == (40, scenes, scenes, verdict)
-    assert len(views._ratios(line.to_frame().T.infer_objects().assign(comparison="")).frame) == 1, (
-        "an interval without an end is drawn too"
-    )
 
 
 def test_planted_errors_alone_have_a_report_that_compares_no_orders(run):
@@ -200,3 +198,21 @@ def test_planted_errors_alone_have_a_report_that_compares_no_orders(run):
         shown = views.views(experiment, rows.reset_index(drop=True))
         (pairs,) = [table for table in shown.tables if table.name in ("pairs", "problems")][:1]
         assert "first order" not in pairs.frame.to_csv()
+
+
+@pytest.mark.parametrize(("ratio", "edge"), [(math.inf, 1.0), (0.0, 0.0)])
+def test_what_the_answer_names_is_first_and_a_ratio_without_a_number_a_cross_at_the_edge(ratio, edge):
+    """Seventeen comparisons stood in one list, and an axis of logarithms dropped the strongest."""
+    ratios = [[f"s{i}", name, r] for i in range(6) for name, r in (("random error 3 / 0.3", 9.0), ("bias 0.6", ratio))]
+    lines = pd.DataFrame(ratios, columns=["scene", "comparison", "ratio"]).assign(scene_class="", target=100.0)
+    chart = views._ratios(analysis.by_scene(lines).query("scene_class == ''"), 'comparison="bias 0.6"')
+    assert chart.frame["row"].tolist() == ["bias 0.6 (6)", "random error 3 / 0.3 (6)"]
+    crosses = [line.get_xdata() for line in draw(chart).axes[0].lines if line.get_marker() == "x"]
+    assert np.concatenate(crosses).tolist() == [edge]
+
+
+@pytest.mark.parametrize("last", [6.0, math.inf])
+def test_the_range_of_searches_has_those_that_miss(last):
+    line = planted("p", analysis.COSTS_ONLY, 0.0, 5.0) | {"rollouts_per_update": 2.0, "gradients_per_update": 0.0}
+    found = analysis.reached(pd.DataFrame([line | {"times": np.array([4.0, 5.0, last])}]))
+    assert found[["fewest", "evaluations", "most"]].to_numpy().tolist() == [[8.0, 10.0, 2 * last]]

@@ -3,13 +3,17 @@
 import io
 from dataclasses import replace
 
+import numpy as np
 import pandas as pd
 import pytest
 from helpers import stored
+from numpy.linalg import norm
 from trees import ROOT
 
 from bench.experiment.columns import COMMON
+from bench.report.draw import BOLD, WIDTH
 from bench.report.finish import views_of
+from bench.report.style import filled
 from bench.report.writer import table_files
 
 EXAMPLE = ROOT / "examples" / "cost_of_error"
@@ -61,3 +65,20 @@ def test_tables_of_stored_rows_are_the_stored_tables(name):
                 pd.testing.assert_frame_equal(*tables_read, rtol=1e-9, atol=1e-300, obj=file)
             else:
                 assert not path.exists() or content == path.read_text(), file
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_title_of_an_experiment_is_one_question_in_one_line(name):
+    """A title of two lines asked two questions, and no row of its chart answered the second."""
+    title = stored(name, *NAMES[name])[0].question
+    assert title.count("?") == title.endswith("?") == 1
+    assert "\n" not in filled(title, 0.97 * WIDTH / BOLD)
+
+
+def test_the_chart_of_a_solver_shows_the_errors_of_stored_gradients_that_have_not_converged():
+    given, rows = stored("solver_iterations")
+    (chart,) = views_of(given, rows).charts
+    drawn = chart.frame
+    errors = [norm(np.subtract(a, b)) / norm(b) for a, b in zip(drawn.gradient, drawn.converged_gradient, strict=True)]
+    assert drawn[chart.y[0].name].to_numpy() == pytest.approx(errors, rel=1e-6, abs=1e-12)
+    assert len(drawn) == (rows["iterations"] < given.study.converged).sum() > 0

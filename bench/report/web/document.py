@@ -62,10 +62,9 @@ def _answers(views: Views) -> str:
 
 
 def _chart(chart: Chart, widths: Sequence[Figure]) -> str:
-    """Return a chart as HTML with its heading and how to read it."""
+    """Return a chart as HTML with its heading."""
     title = chart.title or chart.name.replace("_", " ").capitalize()
-    text = f"<p>{escape(chart.text)}</p>" if chart.text else ""
-    return f"<section><h2>{escape(title)}</h2>{text}{shell.drawing(widths, chart.name, title)}</section>"
+    return f"<section><h2>{escape(title)}</h2>{shell.drawing(widths, chart.name, title)}</section>"
 
 
 def _made(record: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from bench.plugins.studies.optimise import SearchStudy
 
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, seconds, several, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, seconds, setting, several, text
 from bench.model import param
 
 REVISION = 1
@@ -38,8 +38,8 @@ class DoseResponse(SearchStudy):
             "sign_agreement", "share of components with the right sign, median over the thetas", label="right signs"
         ),
         Column("error_start", "relative error at the start"),
-        Column("budget", "most updates of a search: a search that misses a target is censored there", format="setting"),
-        Column("runs", "searches that score; 1 if the gradient does not depend on the noise", format="setting"),
+        setting("budget", "most updates of a search: a search that misses a target is censored there"),
+        setting("runs", "searches that score; 1 if the gradient does not depend on the noise"),
         Column(
             "lowest",
             "lowest regret of the searches at the rate of the last target, share of the first, median",

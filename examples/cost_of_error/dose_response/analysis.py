@@ -39,14 +39,11 @@ COSTS_ONLY = "costs only"
 ORDERS = ("first order", "zeroth order")
 DOSES = {"noise": RANDOM, "bias": BIAS, "angle": ROTATION}
 """Parameters of an estimator with a planted error, and the kind of error."""
-COMPARISONS: dict[str, tuple[tuple[str, float], tuple[str, float]]] = {
-    "random error 3 / 0.3": ((RANDOM, 3.0), (RANDOM, 0.3)),
-    "random error 0.3": ((RANDOM, 0.3), (BEST, 0.0)),
-    "random error 1": ((RANDOM, 1.0), (BEST, 0.0)),
-    "random error 3": ((RANDOM, 3.0), (BEST, 0.0)),
-    "bias 0.6": ((BIAS, 0.6), (BEST, 0.0)),
-    "bias 0.9": ((BIAS, 0.9), (BEST, 0.0)),
-    "bias 0.9 / random error 1": ((BIAS, 0.9), (RANDOM, 1.0)),
+SIZES = ((RANDOM, 0.3), (RANDOM, 1.0), (RANDOM, 3.0), (BIAS, 0.6), (BIAS, 0.9))
+COMPARISONS = {
+    "random error 3 / 0.3": (SIZES[2], SIZES[0]),
+    **{f"{kind} {size:g}": ((kind, size), (BEST, 0.0)) for kind, size in SIZES},
+    "bias 0.9 / random error 1": (SIZES[4], SIZES[1]),
 }
 """Planted errors that are compared on the same problem, by name: numerator and denominator, each a kind and a size."""
 MEASURED = ("error", "bias", "rollouts_per_update", "gradients_per_update", "rollout_s", "gradient_s")
@@ -152,7 +149,7 @@ def ratios(lines: pd.DataFrame) -> pd.DataFrame:
 
     A missed target is infinite, and a problem on which both sides are missed has no ratio. Comparisons: of updates, by
     :data:`COMPARISONS`; of updates at a wrong rate with those at the best one; of rollouts, of the first with the zeroth order, each
-    at its cheapest number of samples; of rollouts at the fewest samples that reach the target with the cheapest other number;
+    at its cheapest number of samples; of updates with an estimator at its best setting with the best gradient; of rollouts at the fewest samples that reach the target with the cheapest other number;
     and of updates at equal error, the median over the cells of an estimator with planted random errors between the planted sizes.
     """
     result = []
@@ -185,6 +182,7 @@ def _sides(own: pd.DataFrame) -> Iterator[tuple[str, tuple[float, float]]]:
             yield f"fewest samples / others, {kind}", (costs[0], costs[1:].min())
     planted = own[(own["kind"] == RANDOM) & np.isfinite(own["median"])].sort_values("error")
     for estimator, part in natural.groupby(natural["method"].str.split("[").str[0]):
+        yield f"{estimator} / {BEST}", (part["median"].min(), part["floor"].iloc[0])
         between = part[part["error"].between(planted["error"].min(), planted["error"].max())]
         if len(between):
             expected = np.interp(*map(np.log, (between["error"], planted["error"], planted["median"])))

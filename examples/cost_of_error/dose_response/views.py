@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import re
 
 import numpy as np
 import pandas as pd
 
 from bench.experiment.axes import table as csv_table
-from bench.experiment.columns import Column, interval, text
+from bench.experiment.columns import Column, interval, setting, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Mark, Style, Table, Views
 from bench.report.colours import method_styles
@@ -18,26 +18,35 @@ from bench.report.style import PALETTE
 from . import analysis
 from .analysis import BEST, MAIN
 
-NO_VERDICT = Style("#767676")
 VERDICTS = {
     "above 1": Style(PALETTE[2], "D", meaning="takes more for certain"),
     "below 1": Style(PALETTE[0], "s", meaning="takes fewer for certain"),
-    "not known": replace(NO_VERDICT, meaning="not known"),
+    "not known": Style("#767676", meaning="not known: the interval includes 1"),
 }
 CLASS, PROBLEMS, SCENES = (
     text("scene_class", label="class"),
-    Column("problems", format="setting"),
-    Column("scenes", format="setting"),
+    setting("problems"),
+    setting("scenes"),
 )
 PAIRS = (
     CLASS,
     text("comparison"),
     PROBLEMS,
     SCENES,
-    Column("above", label="above 1", format="setting"),
+    setting("above", label="above 1"),
     interval("ratio", boundary=1.0),
     text("verdict"),
 )
+PANELS = {
+    r"((?:random error|bias) [\d.]+)": "updates with an error of this size / with the best gradient",
+    r"(\w+) / best gradient": "updates with an estimator at its best setting / with the best gradient",
+    r"first order / zeroth order, gradient (.*)": "rollouts with first order / with zeroth order, where a gradient counts as so many",
+    r"fewest samples / others, (.*)": "rollouts with the fewest samples / with any others",
+    r"(.*) / .*, equal error": "updates with an estimator / with a random error of the same size",
+    r"(.* / .*)": "updates with one error / with the other",
+    r"(.*)": "updates at a wrong rate / at the best rate",
+}
+"""Headings of the ratios by what they compare, the first pattern that matches."""
 PAIR_NOTES = (
     "Ratios of updates, or of rollouts between orders and samples, on the same problem, to 1/100 of the first regret. One size: over "
     "the best gradient. Median over scenes, each with the median of its problems, and its 95% interval. A verdict: the exact sign "
@@ -75,10 +84,10 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
             page=True,
             split="scene_class",
         ),
-        Table("dose_response", csv_table(experiment, rows), [], files=["csv"]),
+        Table("dose_response", csv_table(experiment, rows)),
         _problems(table),
     ]
-    charts = [_ratios(together)] if len(together) else []
+    charts = [_ratios(together, experiment.answer)] if len(together) else []
     if len(beside):  # then the question is what such methods take
         tables, charts = [_reached(beside), *tables[2:]], [_reached_chart(beside)]
     return Views([one for one in tables if len(one.frame)], charts)
@@ -101,26 +110,32 @@ def _problems(table: pd.DataFrame) -> Table:
     return Table("problems", frame, columns, "Problems", PROBLEM_NOTES)
 
 
-def _ratios(pairs: pd.DataFrame) -> Chart:
-    """Return the ratios: a row per comparison, whose interval reaches the edge where it has no end."""
+def _ratios(pairs: pd.DataFrame, answer: str) -> Chart:
+    """Return the ratios: a row per comparison, in panels, that of the experiment's answer first; an interval reaches the edge where it has no end."""
+    places = [
+        next((heading, found[1]) for pattern, heading in PANELS.items() if (found := re.fullmatch(pattern, name)))
+        for name in pairs["comparison"]
+    ]
     frame = pairs.assign(
         is_missed=pairs["ratio"].isin((0.0, np.inf)),
-        comparison=pairs["comparison"] + pairs["scenes"].map(" ({})".format),
+        panel=[heading for heading, _ in places],
+        row=[row for _, row in places] + pairs["scenes"].map(" ({})".format),
     )
+    asked = frame.loc[[f'"{name}"' in answer for name in pairs["comparison"]], "panel"]
     return Chart(
         "ratios",
-        frame,
-        [interval("ratio", label="times the updates; of orders and samples: times the rollouts", log=True)],
-        [text("comparison", label="")],
+        frame.sort_values("panel", key=lambda panel: ~panel.isin(asked), kind="stable"),
+        [interval("ratio", log=True)],
+        [text("row", label="")],
         "dots",
         series="verdict",
+        panel="panel",
+        across=1,
         styles=VERDICTS,
         marks=[Mark("the same", 1.0)],
         failed="is_missed",
-        failed_name="most scenes miss the target; at the left edge: with what it is compared to",
-        height=0.24,
-        subtitle=f"to 1/{MAIN:g} of the first regret, median over scenes, whose number is in brackets; an error alone is compared to the best gradient. "
-        "Gradient 2: it counts as two rollouts",
+        failed_name="infinite or 0: most scenes miss the target",
+        subtitle=f"searches to 1/{MAIN:g} of the first regret, errors relative to the gradient; median over scenes, whose number is in brackets",
     )
 
 
@@ -144,7 +159,7 @@ def _reached(known: pd.DataFrame) -> Table:
 
 def _reached_chart(known: pd.DataFrame) -> Chart:
     looks = method_styles(dict.fromkeys(known["method"])) | {
-        BEST: replace(NO_VERDICT, meaning=f"{BEST}: without noise; where the cost jumps, a mean of rollouts")
+        BEST: Style("#767676", meaning=f"{BEST}: without noise; where the cost jumps, a mean of rollouts")
     }
     most = known.groupby("problem")["rollouts_per_update"].transform("max")
     names = known["problem"].map(short_names(known["problem"])) + most.map(" ({:,.0f})".format)
@@ -167,7 +182,5 @@ def _reached_chart(known: pd.DataFrame) -> Chart:
         styles=looks,
         failed="missed",
         failed_name="most searches miss it",
-        height=0.55,
-        subtitle=f"to 1/{MAIN:g} of the first regret, each method at its best rate, median of searches; in brackets the rollouts that an update takes without a gradient",
-        text="A bar reaches the edge where a search misses the target. A gradient counts as one rollout.",
+        subtitle=f"to 1/{MAIN:g} of the first regret at each method's best rate, median of searches, a gradient counted as a rollout; in brackets the rollouts of an update without gradients",
     )

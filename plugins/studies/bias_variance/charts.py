@@ -14,13 +14,14 @@ import pandas as pd
 
 from bench.errors import unknown
 from bench.experiment.axes import Axis
-from bench.experiment.columns import Column, interval, text
+from bench.experiment.columns import COMMON, Column, interval, text
 from bench.experiment.parameters import PROBLEM
 from bench.experiment.views import Chart, Mark, Style
 from bench.model import SURROGATE, registry
-from bench.report.colours import graded, method_styles, nested
+from bench.report.colours import graded, method_styles
 from bench.report.names import setting, short_names
 from bench.report.problems import ProblemRows, joined, problem_numbers, split_by_problem, titled
+from bench.report.style import colour, marker
 from bench.report.text import axis_value, counted, number, rounded, short_duration
 from bench.report.views import (
     Arranged,
@@ -180,9 +181,18 @@ def _along(
         marks=marks,
         failed="failed",
         across=len(names) if compared else len(drawn),
-        height=2.7 if len(drawn) <= 2 else 2.1,
         styles=_looks(frame["series"].unique() if compared else ()),
-        subtitle=", ".join(filter(None, [subtitle, *notes, *shares])),
+        subtitle=", ".join(
+            filter(
+                None,
+                [
+                    f"{axis.short}: {axis.doc}" * (axis.doc != "" and axis.column not in COMMON),
+                    subtitle,
+                    *notes,
+                    *shares,
+                ],
+            )
+        ),
     )
 
 
@@ -212,11 +222,10 @@ def _lines(problem: ProblemRows, compared: str, names: Sequence[str]) -> pd.Data
 
 
 def _looks(names: Sequence[str]) -> dict[str, Style]:
-    """Return nested looks of backends, or of contact laws with what they are."""
-    short = short_names(names)
+    """Return looks of backends, or of contact laws with what they are."""
     return {
-        name: replace(look, meaning=": ".join(filter(None, (short[name], _summary(name.partition(" on ")[0])))))
-        for name, look in nested(names).items()
+        name: Style(colour(i), marker(i), meaning=": ".join(filter(None, (short, _summary(name.partition(" on ")[0])))))
+        for i, (name, short) in enumerate(short_names(names).items())
     }
 
 
@@ -270,7 +279,6 @@ def _error_and_time(shown: Arranged, subtitle: str) -> Chart | None:
         series="series",
         panel="panel",
         across=2,
-        height=2.2,
         own_scales=True,
         title="What error has one estimate, and what time does it take?",
         subtitle=", ".join(filter(None, [subtitle, FASTEST])),
@@ -349,7 +357,6 @@ def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Cha
         level="grade",
         cell="cell",
         across=1,
-        height=0.2,
         styles={FIRST: Style(GRADES[0.1])} | looks,
         failed_name="not known to be reached",
         title=f"Which method reaches an error of {target:.0%} first?",
@@ -393,7 +400,6 @@ def _estimators(methods: pd.DataFrame) -> Chart:
         styles=looks | {"no result": Style("#f2f2f2")},
         cell="cell",
         across=1,
-        height=0.2,
         title="Where does each estimator win, and where does it fail?",
         failed_name="cannot be used",
         subtitle=", ".join(
@@ -410,11 +416,14 @@ def _estimators(methods: pd.DataFrame) -> Chart:
 
 
 def _family(estimator: str) -> str:
-    """Return an estimator's family by what it needs: costs, gradients or both."""
+    """Return an estimator's family by what it needs: costs, gradients or both, and the jumps of the cost."""
     entry = registry.entries()["estimators"].get(estimator)
-    needs = getattr(entry and entry.plugin, "needs", None)
-    if not isinstance(needs, frozenset):  # of an estimator whose parameters decide what it needs
+    plugin: Any = entry and entry.plugin
+    needs = getattr(plugin, "needs", None)
+    # of an estimator whose parameters decide what it needs there is no set
+    if not isinstance(needs, frozenset) or "grad" not in needs:
         return "costs only"
-    if "grad" in needs:
-        return "gradients and costs" if needs & {"value", "score"} else "gradients of the program"
-    return "costs only"
+    if needs == {"grad"}:
+        return "gradients of the program"
+    knows_jumps = needs == {"grad", "value"} and plugin.unbiased_at_discontinuities
+    return "gradients, costs and the jumps that the scene declares" if knows_jumps else "gradients and costs"

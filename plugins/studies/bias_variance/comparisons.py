@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from bench.experiment.axes import Axis
-from bench.experiment.columns import Column, interval, text
+from bench.experiment.columns import Column, interval, setting, text
 from bench.measure import statistics
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.views import CATEGORIES, Arranged, attempted, estimator_curves, shown_rmse
@@ -40,7 +40,7 @@ LAW = (
 COLUMNS = (
     text("problem", "what distinguishes the problem from the others"),
     text("axis", "the swept quantity along which the problem is reported"),
-    Column("at", "its value", format="setting"),
+    setting("at", "its value"),
     Column(
         "rollouts",
         "rollouts of one estimate at which errors are compared; a gradient counts as the rollouts that take as long",
@@ -197,12 +197,12 @@ def _scaled(methods: pd.DataFrame, scale: pd.Series) -> pd.DataFrame:
 def lowest(equal: pd.DataFrame) -> set[tuple[str, str]]:
     """Return the settings and methods whose interval at equal rollouts lies below that of every other estimator."""
     found = set()
-    for setting, level in equal[equal["status"] == "ok"].groupby("setting", sort=False):
+    for key, level in equal[equal["status"] == "ok"].groupby("setting", sort=False):
         rows = level.to_records()
         for row in rows[~rows.error_is_limit]:
             rivals = rows.error_low[rows.estimator != row.estimator]
             if len(rivals) and (rivals > row.error_high).all():
-                found.add((str(setting), str(row.method)))
+                found.add((str(key), str(row.method)))
     return found
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from bench.experiment.columns import Column, text
+from bench.experiment.columns import Column, setting, text
 from bench.experiment.parameters import DESCENT, number_problems
 from bench.experiment.views import Table
 from bench.report.problems import label_columns, titled
@@ -18,7 +18,7 @@ from .columns import COLUMNS
 
 SHOWN = ("rmse_rel", "rmse_start", "cosine", "grad_norm", "reference_norm", "start_norm")
 PATH = (
-    Column("share", label="descent", format="setting"),
+    setting("share", label="descent"),
     Column("theta", label="|theta|", digits=3),
     Column("cost", label="J", digits=6),
     Column("gradient", label="|grad J|", digits=3),

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from bench.experiment.axes import Axis
-from bench.experiment.columns import Column, interval, text
+from bench.experiment.columns import Column, interval, setting, text
 from bench.experiment.parameters import PROBLEM, VIEWS
 from bench.experiment.views import Table
 from bench.measure.statistics import ends, is_unexplained
@@ -265,7 +265,7 @@ def accuracy_table(best: pd.DataFrame) -> Table:
         text("by"),
         text("fastest"),
         text("cost_text", label="cost"),
-        Column("samples", format="setting"),
+        setting("samples"),
         text("how"),
         text("next"),
         interval("factor", note="factor_note"),

@@ -12,7 +12,7 @@ import pandas as pd
 
 from bench.experiment import axes
 from bench.experiment.axes import Axis
-from bench.experiment.columns import IDENTITY, Column, interval, text
+from bench.experiment.columns import IDENTITY, Column, interval, setting, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import number_problems
 from bench.experiment.views import Table, Views
@@ -125,10 +125,10 @@ def tables(
     return [
         replace(main, data=axes.table(experiment, rows)),
         *others,
-        Table("speed_accuracy", speed_accuracy(rows), [], files=["csv"]),
+        Table("speed_accuracy", speed_accuracy(rows)),
         *([ranking(methods, equal)] if is_ranked else []),
         recommendations(equal),
-        Table("verdicts", methods.drop(columns=["setting", "has_law", *LAW]), [], files=["csv"]),
+        Table("verdicts", methods.drop(columns=["setting", "has_law", *LAW])),
         Table("comparisons", joined.assign(factor_note=limits(joined)), columns, title, COMPARISON_NOTES, data=joined),
         *([] if best.empty else [time_to_accuracy.accuracy_table(best)]),
     ]
@@ -263,7 +263,7 @@ def ranking(methods: pd.DataFrame, equal: pd.DataFrame) -> Table:
     frame = frame.sort_values("worst", kind="stable", na_position="last")
     columns = [
         ESTIMATOR,
-        *(Column(str(name), format="setting") for name in counts),
+        *(setting(str(name)) for name in counts),
         *(
             interval(f"p{i}", label=problem, limit=f"p{i}_is_limit", note=f"p{i}_note")
             for i, problem in enumerate(problems)

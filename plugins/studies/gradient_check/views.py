@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from bench.experiment.axes import with_axes
-from bench.experiment.columns import COMMON, IDENTITY, Column, text
+from bench.experiment.columns import COMMON, IDENTITY, Column, setting, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import PROBLEM
 from bench.experiment.views import Chart, Style, Table, Views
@@ -65,7 +65,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
             title="gradients against differences of the cost",
             notes=[NOTE, *faults, *reasons(rows)],
         ),
-        Table("gradient_components", component_table(rows), [], files=["csv"]),
+        Table("gradient_components", component_table(rows)),
     ]
     charts = [] if points.empty else [_grid(points)]
     columns = [experiment.columns.by_name[name] for name in ("verdict", "best_error", "best_eps")]
@@ -182,7 +182,7 @@ def _lines(shown: Arranged, points: pd.DataFrame) -> tuple[pd.DataFrame, list[Co
     )
     frame = frame.sort_values("error", ascending=False, kind="stable").drop_duplicates(line)
     frame = frame.sort_values(["problem", "place", "rank"], kind="stable")
-    heads = [COMMON.get(name, Column(name, format="setting")) for name in labels]
+    heads = [COMMON.get(name, setting(name)) for name in labels]
     return frame, [*heads, *map(text, ("point", "backends", "verdict")), ERROR, EPS, text("switch")]
 
 
@@ -202,7 +202,7 @@ def _verdicts(points: pd.DataFrame) -> tuple[pd.DataFrame, list[Column]]:
     ]
     columns = [
         *map(text, ("verdict", "meaning", "trusted")),
-        Column("points", format="setting"),
+        setting("points"),
         Column("error", label="largest error"),
         text("scenes"),
     ]
@@ -246,7 +246,6 @@ def _grid(points: pd.DataFrame) -> Chart:
         level="letter",
         cell="letter",
         styles={letter: style for letter, (_, style) in KINDS.items()},
-        height=0.17,
         failed_name="no switch of contact, or no fault under noise, was found",
-        text="The worst verdict over backends and checks.",
+        subtitle=f"the worst verdict over all checks on {' and '.join(points['backend'].unique())}",
     )

@@ -140,10 +140,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
             terminal=True,
             page=True,
         ),
-        *(
-            Table(name, frame, [], files=["csv"])
-            for name, frame in (("estimates", found), ("unnoticed", hidden), ("fits", lines))
-        ),
+        *(Table(name, frame) for name, frame in (("estimates", found), ("unnoticed", hidden), ("fits", lines))),
     ]
     if lines.empty:
         return Views(tables[:1])
@@ -211,6 +208,5 @@ def charts(lines: pd.DataFrame, fits: Sequence[Column]) -> list[Chart]:
             failed_name="no fit converges",
             own_scales=True,
             across=2,
-            height=0.34,
         )
     ]

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import pandas as pd
 
 from bench.experiment.axes import Axis, table
-from bench.experiment.columns import Column, interval, text
+from bench.experiment.columns import Column, interval, setting, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import named
 from bench.experiment.views import Chart, Table, Views
@@ -21,6 +21,7 @@ from bench.measure.statistics import ends
 from bench.report.colours import method_styles
 from bench.report.problems import problem_names, titled
 from bench.report.views import arrange, attempted, estimator_labels
+from bench.report.writer import LEAST
 
 from .. import PARTS
 
@@ -85,6 +86,8 @@ class RunSet:
     """
 
     rows: pd.DataFrame
+    tuned: Sequence[Axis] = ()
+    """The swept parameters of optimizers."""
 
     @cached_property
     def scenes(self) -> pd.Series:
@@ -115,9 +118,14 @@ class RunSet:
         return dict(best[~best.index.duplicated()])
 
     @cached_property
+    def scored(self) -> pd.DataFrame:
+        """The rows without the tuning seeds."""
+        return self.rows[~self.rows["seed"].isin(self.tuning_seeds)]
+
+    @cached_property
     def best_runs(self) -> pd.DataFrame:
-        """The rows of each method's best tuning on each problem, without the tuning seeds."""
-        rows = self.rows[~self.rows["seed"].isin(self.tuning_seeds)]
+        """The rows that score of each method's best tuning on each problem."""
+        rows = self.scored
         best = pd.MultiIndex.from_frame(rows[["problem", "method"]]).map(self.best_tunings)
         return rows[rows["tuning"] == best]
 
@@ -138,7 +146,7 @@ def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
     achievable = (start - best_known).where(start > best_known)
     score = ((start - final) / achievable).clip(0.0, 1.0).mask(runs["status"] != "ok", 0.0)
     ratio = runs.groupby("problem")["gradient_ratio"].transform("median").fillna(experiment.study.gradient_cost)
-    return RunSet(runs.assign(best_known=best_known, best_known_status=status, score=score, ratio=ratio))
+    return RunSet(runs.assign(best_known=best_known, best_known_status=status, score=score, ratio=ratio), tuned_axes)
 
 
 def _is_tuned(axis: Axis, rows: pd.DataFrame) -> bool:
@@ -351,7 +359,7 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet) -> list[Tab
                 SCORE,
                 BETTER,
                 PROFILE,
-                *(Column(name, format="setting") for name in ("tunings", "searches", "diverged")),
+                *(setting(name) for name in ("tunings", "searches", "diverged")),
                 MEDIAN,
             ],
             "methods by the share of targets they reach",
@@ -380,8 +388,8 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet) -> list[Tab
             "Lowest costs",
             terminal=True,
         ),
-        Table("targets", reached, [], files=["csv"]),
-        Table("summary", summary, [], files=["csv"]),
+        Table("targets", reached),
+        Table("summary", summary),
     ]
 
 
@@ -389,7 +397,10 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet) -> list[Tab
 
 
 def charts(runs: RunSet) -> list[Chart]:
-    """Return the share of targets that each method reaches, the largest first, and that single searches reach in time."""
+    """Return the share of targets that each method reaches, the largest first, and that single searches reach in time.
+
+    Where one parameter of the optimizers is swept, the scores along it stand for the shares.
+    """
     problems, times = runs.rows["problem"].unique(), hits(runs)
     where = f"{len(problems)} problems" if len(problems) > 1 else problems[0]
     looks = method_styles(runs.rows["method"].unique())
@@ -401,7 +412,6 @@ def charts(runs: RunSet) -> list[Chart]:
         "dots",
         series="method",
         styles=looks,
-        height=0.24,
         title="Which method reaches most targets?",
         subtitle=f"{where}, targets: a tenth, a hundredth and a thousandth of the first regret",
     )
@@ -409,7 +419,8 @@ def charts(runs: RunSet) -> list[Chart]:
     weight = 1.0 / times.groupby(["problem", "method", "target"])["spent"].transform("size")
     weight = (weight / weight.groupby(times["method"]).transform("sum")).where(times["reached"], 0.0)
     frame = times.assign(share=weight).sort_values("spent", kind="stable")
-    frame = frame.assign(share=frame.groupby("method")["share"].cumsum())
+    starts = frame.drop_duplicates("method").assign(share=0.0, spent=frame["spent"].min())
+    frame = pd.concat([starts, frame.assign(share=frame.groupby("method")["share"].cumsum())])
     share = Column("share", label="share of targets reached", format="percent", log=False)
     runtimes = Chart(
         "runtimes",
@@ -418,10 +429,25 @@ def charts(runs: RunSet) -> list[Chart]:
         [share],
         series="method",
         styles=looks,
-        height=2.6,
         steps=True,
         title="In how many rollouts does each method reach its targets?",
         subtitle=f"{where}, single searches, a gradient counts as its time in rollouts",
-        text="Where a line ends is the share of targets reached in the whole budget.",
     )
-    return [targets, runtimes]
+    swept = [axis for axis in runs.tuned if runs.rows[axis.column].nunique() >= LEAST]
+    return [_along(runs, swept[0], where) if len(swept) == 1 else targets, runtimes]
+
+
+def _along(runs: RunSet, axis: Axis, where: str) -> Chart:
+    """Return the score of each method along a parameter of the optimizers."""
+    groups = runs.scored.dropna(subset="score").groupby(["method", axis.column], sort=False)
+    lines = [{"method": name, axis.column: x, **ends("score", _score(runs, part))} for (name, x), part in groups]
+    return Chart(
+        "tunings",
+        pd.DataFrame(lines),
+        [setting(axis.column, label=axis.title, log=True)],
+        [replace(SCORE, label="share of the way to the lowest cost known")],
+        series="method",
+        styles=method_styles(runs.rows["method"].unique()),
+        title=f"How much does {axis.short} decide?",
+        subtitle=f"{where} with the same {axis.short}, interquartile mean of searches",
+    )

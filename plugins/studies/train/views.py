@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from bench.experiment.axes import Axis, table, values_of
-from bench.experiment.columns import Column, interval, text
+from bench.experiment.columns import Column, interval, setting, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Table, Views
 from bench.measure.performance import bootstrap, interquartile_mean
@@ -35,11 +35,11 @@ SUMMARY = (
     METHOD,
     FINAL,
     VERDICT,
-    Column("settings", format="setting"),
+    setting("settings"),
     Column("tuned", label="at the choosing seeds", digits=3, log=False),
     Column("worst", label="worst seed", digits=3),
-    Column("seeds", format="setting"),
-    Column("failed", label="not finite", format="setting"),
+    setting("seeds"),
+    setting("failed", label="not finite"),
     Column("steps", unit="steps", label="control steps", digits=3),
     Column("used", label="used steps", digits=3),
     interval("equal", label="at equal used steps", digits=3, log=False),
@@ -49,7 +49,7 @@ SUMMARY = (
     Column("gradient_peak", label="largest gradient"),
     Column("cosine", label="cosine"),
 )
-WINDOW = Column("window", label="window", unit="steps", format="setting")
+WINDOW = setting("window", label="window", unit="steps")
 WINDOW_GRADIENT = Column("window_gradient", label="norm of the windows' gradient")
 WINDOW_BIAS = interval("window_bias", label="bias of the windows' gradient")
 WINDOWS = (
@@ -65,15 +65,17 @@ WINDOWS = (
 FAULTS = (
     PROBLEM,
     METHOD,
-    Column("seed", format="setting"),
+    setting("seed"),
     text("code", label="the log shows"),
-    Column("update", format="setting"),
+    setting("update"),
     Column("value"),
 )
 COST = interval("cost", label="minus the return of an episode", ends="95% interval over seeds")
-STEP, TIME = Column("step", label="control steps", log=False), Column("time", label="time of the updates", unit="s")
+STEP, TIME = (
+    Column("step", label="control steps", log=False),
+    Column("time", label="time of the updates", unit="s", log=True),
+)
 SEEDS = f"interquartile mean over seeds, with its 95% bootstrap interval from {MIN_SEEDS} seeds on"
-MIDDLES = "lower is better; interquartile mean over seeds"
 NOTE = (
     f"final return: the mean undiscounted return of the deterministic policy from the same starts, {SEEDS}. A run that is not "
     "finite counts as its untrained policy. used steps: control steps that updates use, median. at equal used steps: the return at "
@@ -328,7 +330,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
             data=table(experiment, rows),
             details=["compile_s", "gradient_typical", "gradient_peak"],
         ),
-        Table("summary", summary, [], files=["csv"]),
+        Table("summary", summary),
     ]
     if len(windows):
         verdicts = ranked(windows.assign(tuned=0.0), ["problem", "family"], "window")
@@ -355,6 +357,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
 
 def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
     frame = curves_of(runs)
+    middles = f"lower is better; interquartile mean over {runs['seed'].nunique()} seeds"
     cost = replace(COST, log=bool((frame["cost"] > 0).all()))
     curves = Chart(
         "train",
@@ -364,14 +367,15 @@ def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
         series="method",
         panel="problem",
         band=True,
-        subtitle=MIDDLES,
+        subtitle=middles,
     )
     times = replace(
         curves,
         name="times",
+        frame=frame[frame["time"] > 0],
         x=[TIME],
         title="Which return is reached after which time of updates?",
-        text="The median time over seeds, beside other work.",
+        subtitle=f"{middles}, median time of runs beside other work",
     )
     final = windows.assign(cost=-windows["final"], cost_low=-windows["final_high"], cost_high=-windows["final_low"])
     lengths = Chart(
@@ -382,6 +386,6 @@ def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
         series="family",
         panel="problem",
         title="What does the length of a window do?",
-        subtitle=f"after training; {MIDDLES}",
+        subtitle=f"after training; {middles}",
     )
     return [replace(one, styles=method_styles(one.frame[one.series].unique())) for one in (curves, times, lengths)]
