@@ -14,7 +14,7 @@ import pytest
 from bench.plugins.studies.bias_variance import views as tables
 from bench.plugins.studies.bias_variance.charts import FLOOR, RMSE
 from bench.plugins.studies.bias_variance.columns import TABLE
-from bench.plugins.studies.bias_variance.comparisons import at_equal_rollouts, lowest, method_table
+from bench.plugins.studies.bias_variance.comparisons import at_equal_rollouts, lowest, method_table, problems_by_axis
 from bench.plugins.studies.bias_variance.time_to_accuracy import with_gradient_cost
 from helpers import (
     BACKENDS,
@@ -280,7 +280,7 @@ def test_a_problem_is_named_by_every_parameter_that_differs_from_its_scenes_defa
             ["scenes=['pushing[horizon=8]']", "sweep.sigma=[0.1,0.3]"],
             "pushing[horizon=8], penalty[stiffness=100000], sigma=0.1",
         ),
-        (["scenes=[pushing]", "sweep.stiffness=[10,1e5]"], "pushing, penalty, stiffness=10"),
+        (["contacts=[penalty]", "scenes=[pushing]", "sweep.stiffness=[10,1e5]"], "pushing, penalty, stiffness=10"),
         (["scenes=[pushing]", "sweep.mass=[0.1,0.2]"], "pushing, penalty[stiffness=100000], mass=0.1"),
     ):
         given, cells = loaded(*words, *more)
