@@ -280,7 +280,7 @@ def test_a_problem_is_named_by_every_parameter_that_differs_from_its_scenes_defa
             ["scenes=['pushing[horizon=8]']", "sweep.sigma=[0.1,0.3]"],
             "pushing[horizon=8], penalty[stiffness=100000], sigma=0.1",
         ),
-        (["scenes=[pushing]", "contacts=[penalty]", "sweep.stiffness=[10,1e5]"], "pushing, penalty, stiffness=10"),
+        (["contacts=[penalty]", "scenes=[pushing]", "sweep.stiffness=[10,1e5]"], "pushing, penalty, stiffness=10"),
         (["scenes=[pushing]", "sweep.mass=[0.1,0.2]"], "pushing, penalty[stiffness=100000], mass=0.1"),
     ):
         given, cells = loaded(*words, *more)
