@@ -7,55 +7,45 @@ import math
 import random
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bench.errors import UserError, failure, needing_sweeps
-from bench.examine.few import ROUNDS, FewSteps
+from bench.examine.few import ROUNDED, ROUNDS, FewSteps
 from bench.examine.lines import scan
 from bench.examine.subspace import Group, Subspace
 from bench.gradient import FAULTS, RULES
+from bench.measure.statistics import ends
 from bench.simulator.simulator import Simulator
 from bench.simulator.tree import ParameterTree, numbers
 
-Costs = Callable[[np.ndarray], np.ndarray]
-"""Costs of columns: ``(d, B)`` to ``(B,)``."""
-DIRECTIONS = 2
-"""Random directions along which a gradient is compared with differences."""
+EQUAL = 4
+"""Equal calls of the cost, whose range is its noise: two calls are often close together by chance."""
 PAIRS = 8
 """Mirrored pairs of a zeroth-order estimate."""
-SHARES = (1.0, 0.1, 0.01)
+SHARES = np.array([1.0, 0.1, 0.01])
 """Shares of the last step's length at which a step against the gradient is tried."""
 LINE = (9, 6, 1)
 """Points, halvings and places of the search for jumps along the last step."""
 FIRST_STEP = 1e-3
 """Length of a step before the first one, in units of the scale of theta."""
+COMPILING = 2
+"""First checks that do not count in the share: a cost in JAX compiles at both if arrays change their type in an update."""
 COLUMNS = (
-    "iteration",
-    "cost",
-    "gradient_norm",
-    "verdict",
-    "error",
-    "noise",
-    "ratio",
-    "ratio_low",
-    "ratio_high",
-    "cosine",
-    "cosine_low",
-    "cosine_high",
-    "jumps",
-    "largest_jump",
-    "lowers",
-    "costs",
-    "seconds",
-    "reason",
+    *("iteration", "cost", "noise", "precision", "gradient_norm", "gradient_spread", "verdict", "error"),
+    *("ratio", "ratio_low", "ratio_high", "cosine", "cosine_low", "cosine_high"),
+    *("jumps", "largest_jump", "lowers", "seconds", "reason"),
 )
+USABLE = 0.1
+"""Largest relative error of a slope along a gradient of use, as in the log of a training."""
 LARGER, EARLIER = 200.0, 3
-"""Factor on the largest norm of at least this number of earlier checks above which a gradient explodes."""
+"""Factor on the largest norm of at least this number of earlier rows above which a gradient explodes."""
 MEANINGS = {
     "opposed": f"the cosine of the gradient with a zeroth-order estimate is certainly below 0 in {EARLIER} checks in a row",
     "not_finite": "theta or its gradient is not finite",
@@ -69,47 +59,39 @@ class Watch:
 
     ``cost(theta)`` returns one number, or ``cost(theta, w)`` where the calls pass what else belongs to the gradient, ``w``.
     Every ``every`` iterations the norm of the gradient is noted, and the gradient is checked unless that would take more than
-    ``share`` of the loop's time, without the first check, which may compile. JAX compiles only a cost that is compiled itself,
-    ``jax.jit(cost)``. ``out`` is a CSV file of the rows. ``str()`` names the first noted iteration at which the gradient was
-    of no use.
+    ``share`` of the loop's time, without the first two checks, which may compile. JAX compiles only a cost that is compiled
+    itself, ``jax.jit(cost)``. ``out`` is a CSV file of the rows. ``str()`` names the first noted iteration at which the
+    gradient was of no use. Raises :class:`UserError` for other arguments, and OSError where ``out`` cannot be written.
 
-    ``rows`` has a line per noted iteration: the norm of the gradient and, where it was checked, the verdict along random
-    directions with the largest relative error, the difference of two equal calls of the cost, ratio and cosine of a
-    zeroth-order estimate from mirrored pairs to the gradient, with 95% intervals, the jumps along the last step, and the share
-    of its length at which a step against the gradient lowers the cost (0: at none).
+    ``rows`` has a line per noted iteration: the norm of the gradient and its distance from the one before, relative to the
+    norm, and, where it was checked, the verdict along itself and a random direction with its largest relative error, the range of
+    equal calls of the cost, ratio and cosine of a zeroth-order estimate from mirrored pairs to the gradient, with 95%
+    intervals, the jumps along the last step, and the share of its length at which a step against the gradient lowers the cost
+    (0: at none).
 
     >>> log = Watch(lambda x: float(x @ x), every=1, share=math.inf)
     >>> log(np.array([1.0, 2.0]), np.array([2.0, 4.0]))
     >>> print(log)
-    1 of 1 iterations checked: no fault of the gradient
+    1 of 1 iterations checked (1 smooth): no fault of the gradient
     """
 
     def __init__(
-        self,
-        cost: Callable[..., Any],
-        every: int = 50,
-        out: str | Path | None = None,
-        share: float = 0.1,
-        seed: int = 0,
+        self, cost: Callable[..., Any], every: int = 50, out: str | Path | None = None, share: float = 0.1
     ) -> None:
-        if not callable(cost):
-            raise UserError(f"the cost is a function of theta, not {type(cost).__name__}")
-        if not (isinstance(every, int) and every > 0):
-            raise UserError(f"every={every} is not a number of iterations: give a whole number above 0")
-        if not share > 0:
-            raise UserError(f"share={share} is not a share of the loop's time: give a number above 0, such as 0.1")
-        self.cost, self.every, self.share, self.seed = cost, every, share, seed
-        self.out = None if out is None else Path(out)
+        is_real = callable(cost) and isinstance(every, Integral) and isinstance(share, Real)
+        if not (is_real and every > 0 and share > 0):
+            wanted = "the cost is a function of theta, every= a whole number above 0, share= a number above 0"
+            raise UserError(f"{wanted}; given are {cost!r}, every={every!r}, share={share!r}")
+        self.cost, self.every, self.share, self.out = cost, every, share, out
+        if out:
+            with open(out, "a"):
+                pass
         self.rows: list[dict[str, Any]] = []
         self.iteration = -1
         """The last iteration, counted from 0."""
-        self._simulator: Simulator | None = None
-        self._given: tuple[Any, ...] = ()
-        self._before = np.empty(0)
+        self._before = [np.empty(0)] * 2
         self._began = time.perf_counter()
-        self._spent = self._longest = 0.0
-        self._written = 0
-        self._unwritten = ""
+        self._written, self._unwritten = 0, ""
 
     def __call__(self, theta: Any, gradient: Any, w: Any = None) -> None:
         """Count an iteration; if it is due, note the gradient's norm, and check the gradient if the share of time allows.
@@ -120,12 +102,12 @@ class Watch:
         """
         self.iteration += 1
         if self.iteration % self.every == 0:
-            self._check(theta, gradient, w)
+            self._note(theta, gradient, *() if w is None else (w,))
         if (self.iteration + 1) % self.every == 0:
             with suppress(Exception):  # such as a buffer that the loop has given away
-                self._before = numbers(theta).copy()
+                self._before = [numbers(theta).copy(), numbers(gradient).copy()]
 
-    def _check(self, theta: Any, gradient: Any, w: Any) -> None:
+    def _note(self, theta: Any, gradient: Any, *given: Any) -> None:
         """Add a row on the gradient at theta, and write it."""
         began = time.perf_counter()
         row: dict[str, Any] = dict.fromkeys(COLUMNS, math.nan) | {
@@ -135,58 +117,40 @@ class Watch:
         }
         with _same_random_numbers(), np.errstate(all="ignore"):
             try:
-                self._measure(row, theta, gradient, w)
+                self._measure(row, theta, gradient, given)
             except Exception as error:
-                row["reason"] = failure(error)["reason"]
-        taken = row["seconds"] = time.perf_counter() - began
-        if self.rows:  # the first check may compile
-            self._spent, self._longest = self._spent + taken, max(self._longest, taken)
-        else:
-            self._began += taken
+                row["reason"] = str(error) if isinstance(error, UserError) else failure(error)["reason"]
+        row["seconds"] = time.perf_counter() - began
         self.rows.append(row)
         if not self.out:
             return
         lines = [one.values() for one in self.rows[self._written :]]
         try:
-            with self.out.open("a" if self._written else "w", newline="") as file:
+            with open(self.out, "a" if self._written else "w", newline="") as file:
                 csv.writer(file).writerows(lines if self._written else [COLUMNS, *lines])
             self._written, self._unwritten = len(self.rows), ""
         except OSError as error:
             self._unwritten = f", {self.out} cannot be written: {error}"
 
-    def _measure(self, row: dict[str, Any], theta: Any, gradient: Any, w: Any) -> None:
+    def _measure(self, row: dict[str, Any], theta: Any, gradient: Any, given: tuple[Any, ...]) -> None:
         """Add what is known of theta and its gradient to a row."""
-        if not np.isfinite(numbers(theta)).all():
-            return
-        layout = ParameterTree(theta)
-        slopes, self._given = layout.flatten(gradient), () if w is None else (w,)
+        with suppress(TypeError):  # of what is not numbers, which the next line names
+            if not np.isfinite(numbers(theta)).all():
+                return
+        layout, slopes, last = ParameterTree(theta), numbers(gradient), self._before
+        if last[1].size == slopes.size:
+            row["gradient_spread"] = float(np.linalg.norm(slopes - last[1]) / np.linalg.norm(slopes))
+        slopes = layout.flatten(gradient).astype(np.float64)
         row["gradient_norm"] = float(np.linalg.norm(slopes))
-        if self._spent + self._longest > self.share * (time.perf_counter() - self._began):
+        seconds = [one["seconds"] for one in self.rows]
+        loop, counted = time.perf_counter() - self._began - sum(seconds[:COMPILING]), seconds[COMPILING:]
+        if sum(counted) + max(counted, default=0.0) > self.share * loop:
             return
-        if self._simulator is None:
-            self._simulator = Simulator(lambda x: self.cost(x, *self._given), layout, compiles=False)
-        simulator, at, scale = self._simulator, layout.vector, layout.scales()
-        before, costs = simulator.clock.counts["costs"], simulator.costs
-        draw = np.random.default_rng([self.seed, self.iteration])
-        vectors = [scale * (one / np.linalg.norm(one)) for one in draw.standard_normal((DIRECTIONS, at.size))]
-        space = Subspace(layout, scale, [], [Group(f"direction {i}", 0, at.size, v) for i, v in enumerate(vectors)])
-        value, again = (float(costs(at[:, None])[0]) for _ in range(2))
-        noise = abs(again - value)
-        few = FewSteps(space, costs, slopes, value, simulator.unit, noise)
-        for size in ROUNDS:
-            few.run_round(size, simulator.width)
-        checked = few.check()
-        row |= {
-            "cost": value,
-            "verdict": checked.cause,
-            "error": max(part.error for part in checked.parts),
-            "noise": noise,
-        }
-        if np.isfinite(slopes).all():
-            has_moved = self._before.size == at.size and (self._before != at).any()
-            step = at - self._before if has_moved else FIRST_STEP * scale
-            row |= _pairs(costs, at, slopes, step, draw) | _along(costs, at, slopes, step, value, noise, simulator.unit)
-        row["costs"] = simulator.clock.counts["costs"] - before
+        simulator = Simulator(lambda x: self.cost(x, *given), layout, compiles=False)
+        has_moved = last[0].size == layout.vector.size and (last[0] != layout.vector).any()
+        step = layout.vector - last[0] if has_moved else FIRST_STEP * layout.scales()
+        row |= _compare(simulator, slopes, step, np.random.default_rng(self.iteration))
+        row["reason"] = next(iter(simulator.raised["costs"]), "")
 
     @property
     def first(self) -> tuple[int, str] | None:
@@ -194,10 +158,9 @@ class Watch:
         cosines: list[float] = []
         largest = 0.0
         for k, row in enumerate(self.rows):
-            if row["costs"] > 0:
-                cosines.append(row["cosine_high"])
+            cosines += [row["cosine_high"]] * bool(row["verdict"])
             reasons = {
-                row["verdict"]: row["verdict"] in FAULTS,
+                row["verdict"]: row["verdict"] in FAULTS and not row["error"] <= USABLE,
                 "not_finite": not (row["reason"] or math.isfinite(row["gradient_norm"])),
                 "opposed": sum(cosine < 0.0 for cosine in cosines[-EARLIER:]) == EARLIER,
                 "explodes": k >= EARLIER and row["gradient_norm"] > LARGER * largest,
@@ -208,71 +171,82 @@ class Watch:
         return None
 
     def __str__(self) -> str:
-        checks = f"{sum(row['costs'] > 0 for row in self.rows)} of {self.iteration + 1} iterations checked"
-        failed = [row for row in self.rows if row["reason"]]
-        text = (f"{checks}, {len(failed)} not: {failed[0]['reason']}" if failed else checks) + self._unwritten
+        verdicts = Counter(row["verdict"] for row in self.rows if row["verdict"])
+        counts = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items()) or "none"
+        text = f"{verdicts.total()} of {self.iteration + 1} iterations checked ({counts})"
+        if reasons := [row["reason"] for row in self.rows if row["reason"]]:
+            text += f", {len(reasons)} with errors: {reasons[0]}"
+        text += self._unwritten
         if self.first is None:
-            return f"{text}: {'no fault of the gradient' if len(self.rows) > len(failed) else 'nothing is known of the gradient'}"
+            return f"{text}: {'no fault of the gradient' if verdicts else 'nothing is known of the gradient'}"
         iteration, code = self.first
         meaning = RULES[code].meaning if code in RULES else MEANINGS[code]
         return f"{text}: of no use from iteration {iteration} on ({code}: {meaning})"
 
-    def draw(self, path: str | Path) -> Path:
-        """Write a chart of the log and return its path; needs Matplotlib."""
+    def draw(self, path: str | Path) -> None:
+        """Write a chart of the log; needs the extra ``sweeps``."""
         with needing_sweeps("a chart"):
-            from matplotlib.figure import Figure
+            import pandas as pd
 
-        figure = Figure(figsize=(7.0, 6.0), layout="constrained")
-        scales = {"gradient_norm": "log", "error": "log", "cosine": "linear"}
-        for panel, (name, scale) in zip(figure.subplots(3, sharex=True), scales.items(), strict=True):
-            rows = [row for row in self.rows if math.isfinite(row[name])]
-            at = [row["iteration"] for row in rows]
-            panel.plot(at, [row[name] for row in rows], "o-")
-            panel.set(ylabel=name.replace("_", " "), yscale=scale)
-            if self.first is not None:
-                panel.axvline(self.first[0], color="tab:red", label=self.first[1])
-                panel.legend()
-        low, high = ([row[f"cosine_{end}"] for row in rows] for end in ("low", "high"))
-        panel.fill_between(at, low, high, alpha=0.2)
-        panel.set_xlabel("iteration")
-        figure.savefig(path, dpi=150)
-        return Path(path)
+            from bench.experiment.columns import Column, interval
+            from bench.experiment.views import Chart, Mark
+            from bench.report.draw import draw
+
+        x, y = (
+            [Column("iteration", log=False)],
+            [Column("gradient_norm"), Column("error"), interval("cosine", log=False)],
+        )
+        marks = [Mark(code, at) for at, code in filter(None, [self.first])]
+        frame = pd.DataFrame(self.rows, columns=COLUMNS)
+        draw(Chart("watch", frame, x, y, "points", marks=marks, own_scales=True)).savefig(path, dpi=150)
 
 
-def _pairs(
-    costs: Costs, at: np.ndarray, slopes: np.ndarray, step: np.ndarray, draw: np.random.Generator
-) -> dict[str, float]:
-    """Return ratio and cosine of slopes of mirrored pairs to those of the gradient, with the intervals of a regression."""
+def _compare(simulator: Simulator, slopes: np.ndarray, step: np.ndarray, draw: np.random.Generator) -> dict[str, Any]:
+    """Return what costs say of the gradient at theta: mirrored pairs, differences, and costs along the last step."""
     from scipy.special import stdtrit
 
-    moved = draw.standard_normal((at.size, PAIRS)) * np.linalg.norm(step) / math.sqrt(at.size)
-    both = costs(np.concatenate([at[:, None] + moved, at[:, None] - moved], axis=1)).reshape(2, PAIRS)
-    of_costs, of_gradient = (both[0] - both[1]) / 2.0, slopes @ moved
-    square, limit = float(of_gradient @ of_gradient), float(stdtrit(PAIRS - 1, 0.975))
-    ratio = float(of_costs @ of_gradient) / square
-    error = limit * float(np.linalg.norm(of_costs - ratio * of_gradient)) / math.sqrt((PAIRS - 1) * square)
-    to_cosine = math.sqrt(square) / float(np.linalg.norm(of_costs))
-    ends = {"": ratio, "_low": ratio - error, "_high": ratio + error}
-    return {f"ratio{end}": value for end, value in ends.items()} | {
-        f"cosine{end}": float(np.clip(value * to_cosine, -1.0, 1.0)) for end, value in ends.items()
-    }
+    def along(vectors: np.ndarray) -> np.ndarray:
+        return simulator.costs(at[:, None] + vectors)
 
+    at, scale, length = simulator.layout.vector, simulator.layout.scales(), np.linalg.norm(step)
+    values = along(np.zeros((at.size, EQUAL)))
+    value, noise = float(values[0]), float(np.ptp(values))
+    moved = draw.standard_normal((at.size, PAIRS)) * length / math.sqrt(at.size)
+    of_gradient, of_costs = slopes @ moved, along(np.c_[moved, -moved]).reshape(2, PAIRS).T @ [0.5, -0.5]
+    square = of_gradient @ of_gradient
+    ratio = of_costs @ of_gradient / square
+    error = np.linalg.norm(of_costs - ratio * of_gradient) / np.sqrt((PAIRS - 1) * square)
+    ratios = ratio + stdtrit(PAIRS - 1, 0.975) * error * np.array([0.0, -1.0, 1.0])
+    cosines = np.clip(ratios * np.sqrt(square / (of_costs @ of_costs)), -1.0, 1.0)
 
-def _along(
-    costs: Costs, at: np.ndarray, slopes: np.ndarray, step: np.ndarray, value: float, noise: float, unit: float
-) -> dict[str, float]:
-    """Return the jumps along the last step, and the share of its length at which a step against the gradient lowers the cost."""
-    line = scan(lambda t: costs(at[:, None] + step[:, None] * (t - 1.0) / 2.0), step, noise, 1.0, LINE, unit)
-    length, norm = float(np.linalg.norm(step)), float(np.linalg.norm(slopes))
-    down = -slopes * (length / norm if norm else 0.0)
-    changes = costs(at[:, None] + down[:, None] * np.array(SHARES)) - value
-    rounding = 16.0 * (unit * abs(value) + noise)
-    lowered = [share for share, change in zip(SHARES, changes, strict=True) if change < 0.0]
-    is_known = bool((changes > rounding).all())
+    if simulator.has_single_precision:  # behind a cost of double precision
+        simulator.precision = "float32"
+    unit = simulator.unit
+    down = np.nan_to_num(-slopes * length / np.linalg.norm(slopes))  # 0 without a direction
+    vectors = draw.standard_normal((2, at.size))
+    if down.any():  # whose slope stands out most from rounding
+        vectors[0] = scale * down
+    groups = [Group("", 0, at.size, scale * one / np.linalg.norm(one)) for one in vectors]
+    few = FewSteps(Subspace(simulator.layout, scale, [], groups), simulator.costs, slopes, value, unit, noise)
+    for size in ROUNDS:
+        few.run_round(size, simulator.width)
+    checked = few.check()
+
+    jumps = scan(lambda t: along(step[:, None] * (t - 1.0) / 2.0), step, noise, 1.0, LINE, unit).jumps
+    changes = along(down[:, None] * SHARES) - value
+    lowers = SHARES[changes < 0.0].max(initial=0.0)
+    is_known = lowers or (changes > ROUNDED * (unit * abs(value) + noise)).all()
     return {
-        "jumps": len(line.jumps),
-        "largest_jump": max((jump.size for jump in line.jumps), default=0.0),
-        "lowers": max(lowered, default=0.0 if is_known else math.nan),
+        "cost": value,
+        "noise": noise,
+        "precision": unit,
+        "verdict": checked.cause,
+        "error": max(part.error for part in checked.parts if part.verdict == checked.cause),
+        "jumps": len(jumps),
+        "largest_jump": max((jump.size for jump in jumps), default=0.0),
+        "lowers": float(lowers) if is_known else math.nan,
+        **ends("ratio", ratios.tolist()),
+        **ends("cosine", cosines.tolist()),
     }
 
 
@@ -280,11 +254,9 @@ def _along(
 def _same_random_numbers() -> Iterator[None]:
     """Restore the states of the global random generators of Python, NumPy and PyTorch afterwards."""
     torch = sys.modules.get("torch")
-    states = random.getstate(), np.random.get_state(), torch and torch.random.get_rng_state()  # noqa: NPY002
-    try:
+    devices = range(torch.cuda.device_count()) if torch and torch.cuda.is_initialized() else ()
+    states = random.getstate(), np.random.get_state()  # noqa: NPY002
+    with torch.random.fork_rng(devices) if torch else nullcontext():
         yield
-    finally:
-        random.setstate(states[0])
-        np.random.set_state(states[1])  # noqa: NPY002
-        if torch:
-            torch.random.set_rng_state(states[2])
+    random.setstate(states[0])
+    np.random.set_state(states[1])  # noqa: NPY002

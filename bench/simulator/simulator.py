@@ -252,7 +252,7 @@ class Simulator:
         import torch
 
         dtype = getattr(torch, leaf.dtype) if leaf.library == "torch" or self._double else torch.float32
-        return torch.as_tensor(part).to(dtype)
+        return torch.as_tensor(part).to(leaf.device, dtype)
 
     def _array(self, value: np.ndarray) -> Any:
         """Convert an array to the library's array type."""

@@ -35,6 +35,8 @@ class Leaf:
     """``numpy``, ``jax``, ``torch``, or ``number`` for a plain Python number."""
     dtype: str
     """Its floating-point type."""
+    device: str = "cpu"
+    """Where a tensor of torch is."""
 
     @property
     def size(self) -> int:
@@ -73,9 +75,12 @@ class ParameterTree:
         for path, value in _arrays(theta):
             array = as_numpy(value)
             if array.dtype.kind not in "fiu":
-                raise UserError(f"{path or 'theta'} is of type {array.dtype}: theta consists of real numbers")
+                given = type(value).__name__ if array.dtype.kind == "O" else array.dtype
+                raise UserError(f"{path or 'theta'} is of type {given}: theta consists of real numbers")
             dtype = str(array.dtype) if array.dtype.kind == "f" else "float64"
-            self.leaves.append(Leaf(path, array.shape, start, _library(value), dtype))
+            library = _library(value)
+            device = str(getattr(value, "device", "cpu")) if library == "torch" else "cpu"
+            self.leaves.append(Leaf(path, array.shape, start, library, dtype, device))
             values.append(array.astype(np.float64).ravel())
             start += array.size
         if not start:
@@ -266,7 +271,7 @@ def _restore(part: np.ndarray, leaf: Leaf) -> Any:
     if leaf.library == "torch":
         import torch
 
-        return torch.as_tensor(np.array(part), dtype=getattr(torch, leaf.dtype))
+        return torch.as_tensor(np.array(part), dtype=getattr(torch, leaf.dtype), device=leaf.device)
     return np.array(part, dtype=leaf.dtype)
 
 
