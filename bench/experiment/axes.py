@@ -13,8 +13,8 @@ import numpy as np
 from bench.experiment.experiment import Experiment
 from bench.experiment.grid import COUNTS, expand, parameter_name, swept
 from bench.experiment.parameters import (
+    OWN_COLUMNS,
     THETA,
-    VIEWS,
     flat_rows,
     labels,
     named,
@@ -68,14 +68,14 @@ def _number(value: Any) -> float:
     return float(value) if is_number or value in ("inf", "-inf") else math.nan
 
 
-def shown_by(view: str, axis: Axis, rows: pd.DataFrame) -> np.ndarray:
-    """Return, per row, whether the column ``view`` (``stiffness`` or ``smoothing``) shows the axis for its contact law."""
+def shown_by(column: str, axis: Axis, rows: pd.DataFrame) -> np.ndarray:
+    """Return, per row, whether ``column`` (``stiffness`` or ``smoothing``) shows the axis for its contact law."""
 
     found = named(rows, axis.names)
     of_law = [
         (part, law, name)
         for part, law, name in found
-        if part == "contact" and name == (smoothing_of(law) if view == "smoothing" else view)
+        if part == "contact" and name == (smoothing_of(law) if column == "smoothing" else column)
     ]
     return found[of_law].notna().any(axis=1).to_numpy()
 
@@ -176,8 +176,8 @@ def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
     import pandas as pd
 
     names = [name for axis in axes for name in axis.names]
-    views = [name for name in VIEWS if (rows.groupby(["scene", "contact"])[name].nunique() > 1).any()]
+    columns = [name for name in OWN_COLUMNS if (rows.groupby(["scene", "contact"])[name].nunique() > 1).any()]
     codes, texts = pd.factorize(rows["parameters"])
-    lines = [labels(parsed(text), names, views) for text in texts]
+    lines = [labels(parsed(text), names, columns) for text in texts]
     found = pd.DataFrame(lines, dtype=object).iloc[codes].set_axis(rows.index)
     return rows.assign(**{name: found[name].fillna(rows[name]) for name in found if name in rows})

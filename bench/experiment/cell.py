@@ -206,15 +206,15 @@ class Cell:
         return theta | {"path": "none"}  # the cell is refused
 
     def columns(self) -> dict[str, Any]:
-        """Return the identity columns of the cell's row: views of its parameters and counts."""
+        """Return the identity columns of the cell's row, from its parameters and counts."""
         law = self.contact
         smoothing = getattr(law, law.smoothing) if law is not None and law.smoothing else math.nan
         return {
             **labels(self.parameters),
             "noise": "parameter" if self.decision.names else self.scene.noise,
-            "horizon": self._view("horizon", self.scene, default=0),
-            "dt": self._view("dt", self.scene),
-            "stiffness": self._view("stiffness", law, self.scene),
+            "horizon": self._own_column("horizon", self.scene, default=0),
+            "dt": self._own_column("dt", self.scene),
+            "stiffness": self._own_column("stiffness", law, self.scene),
             "sigma": self.scene.sigma,
             "smoothing": smoothing,
             "draws": getattr(self.parts.get("estimator"), "draws", "iid"),
@@ -230,7 +230,7 @@ class Cell:
             "key": self.key,
         }
 
-    def _view(self, name: str, *parts: Plugin | None, default: float = math.nan) -> float:
+    def _own_column(self, name: str, *parts: Plugin | None, default: float = math.nan) -> float:
         """Return the parameter ``name`` of the first part that has it, or ``default``."""
         for part in parts:
             if part is not None and name in parameters(type(part)):

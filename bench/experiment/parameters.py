@@ -31,7 +31,7 @@ DESCENT = "descent"
 """The axis of the share of a descent that is done at theta0."""
 THETA = "theta0"
 """The axis of the point at which gradients are taken: ``theta0``, or ``theta0.2`` for one of its coordinates."""
-VIEWS = ("horizon", "dt", "sigma", "stiffness", "noise", "dtype", "smoothing")
+OWN_COLUMNS = ("horizon", "dt", "sigma", "stiffness", "noise", "dtype", "smoothing")
 """Plugin parameters with their own columns, which are therefore omitted from identity strings."""
 PROBLEM = ("scene", "contact", "integrator")
 """The parts of the grid that decide the simulation, and so the gradient that estimates are compared with."""
@@ -129,16 +129,18 @@ def identity_of(given: Mapping[str, Any], axis: str, omitted: Collection[str | N
     return identity(plugin.name, {k: v for k, v in kept.items() if v != defaults.get(k, dataclasses.MISSING)})
 
 
-def labels(given: Mapping[str, Any], swept: Collection[str] = (), views: Collection[str] = VIEWS) -> dict[str, str]:
-    """Return identity strings by column, without ``views`` and the parameters of ``swept`` names; none of plugins that are not installed."""
+def labels(
+    given: Mapping[str, Any], swept: Collection[str] = (), columns: Collection[str] = OWN_COLUMNS
+) -> dict[str, str]:
+    """Return identity strings by column, without ``columns`` and the parameters of ``swept`` names; none of plugins that are not installed."""
     hidden = {
         axis: {applies(name, axis, part["name"], part) for name in swept} if part else set()
         for axis, part in given.items()
         if axis not in NOT_PLUGINS
     }
-    omitted = {axis: names if axis == "estimator" else {*names, *views} for axis, names in hidden.items()}
+    omitted = {axis: names if axis == "estimator" else {*names, *columns} for axis, names in hidden.items()}
     law = plugin_class("contact", (given.get("contact") or {}).get("name"))
-    if law and "smoothing" in views:
+    if law and "smoothing" in columns:
         omitted["contact"].add(getattr(law, "smoothing", ""))
     if law and "stiffness" in parameters(law) and "stiffness" not in hidden["scene"]:
         omitted["scene"].discard("stiffness")  # the column of that name is the law's

@@ -12,7 +12,7 @@ import pandas as pd
 
 from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, interval, setting, text
-from bench.experiment.parameters import PROBLEM, VIEWS
+from bench.experiment.parameters import OWN_COLUMNS, PROBLEM
 from bench.experiment.views import Table
 from bench.measure.statistics import ends, is_unexplained
 from bench.model import registry
@@ -30,7 +30,9 @@ def with_gradient_cost(rows: pd.DataFrame) -> pd.DataFrame:
     The ratio is seconds per gradient over seconds per rollout, per program and backend, from the fastest row that uses only
     gradients and the fastest that uses only rollouts, at the largest number of samples with both.
     """
-    program = rows.groupby([name for name in (*PROBLEM, *VIEWS, "backend") if name in rows], dropna=False).ngroup()
+    program = rows.groupby(
+        [name for name in (*PROBLEM, *OWN_COLUMNS, "backend") if name in rows], dropna=False
+    ).ngroup()
     known = rows[(rows["status"] == "ok") & (rows["time_s"] > 0)]
     gradients, rollouts = known["gradients"], known["rollouts"]
 
