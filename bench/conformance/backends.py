@@ -16,7 +16,7 @@ from bench.conformance.subjects import (
     N_COLUMNS,
     ROUNDED,
     SAME,
-    SIGNIFICANT,
+    Z_LIMIT,
     BareScene,
     NewtonOps,
     agree,
@@ -219,7 +219,7 @@ def score_is_that_of_actions(backend: Backend) -> str:
         count = 64 if isinstance(backend, EngineBackend) else 4096
         many = problem.score(program.theta0, rng("scores").standard_normal((program.n_noise, count)))
         z = np.abs(many.mean(axis=1)) / (many.std(axis=1) / np.sqrt(count))
-        require(z.max() < SIGNIFICANT, f"{describe(program)}: the mean is {z.max():.1f} standard errors from zero")
+        require(z.max() < Z_LIMIT, f"{describe(program)}: the mean is {z.max():.1f} standard errors from zero")
         details.append(f"{describe(program)}: {found.cause}, mean within {z.max():.1f} standard errors of 0")
     return "; ".join(details) or "w / sigma"
 

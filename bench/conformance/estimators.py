@@ -15,7 +15,7 @@ from bench.conformance.kit import Failed, Skipped, require, skip_unless, verifie
 from bench.conformance.scenes import closed_form_is_right
 from bench.conformance.subjects import (
     DIFFERENCED,
-    SIGNIFICANT,
+    Z_LIMIT,
     distance,
     plain_backend,
     rng,
@@ -303,7 +303,7 @@ def variance_falls_as_one_over_n(estimator: Estimator) -> str:
         logs[i] = np.log(variance)
     slopes = np.polyfit(np.log(counts), logs, 1)[0]
     slope, error = slopes.mean(), slopes.std(ddof=1) / math.sqrt(groups)
-    allowed = SIGNIFICANT * error + 0.02  # 0.02 allows terms of order 1/N^2 (leave-one-out baselines) at N = 32
+    allowed = Z_LIMIT * error + 0.02  # 0.02 allows terms of order 1/N^2 (leave-one-out baselines) at N = 32
     detail = f"slope {slope:.3f} +- {error:.3f}"
     require(slope < -1 + allowed, f"{detail}: falls slower than 1/N")
     is_coupled = estimator.couples_samples and not isinstance(estimator, SampleMean)
@@ -335,9 +335,7 @@ def bias_across_jumps_is_as_declared(estimator: Estimator) -> str:
     for oracle in candidates:
         z, bias = _standard_errors(estimator, oracle, 4, 4096)
         detail = f"bias {np.linalg.norm(bias):.3g} on {oracle.label}"
-        require(
-            z.max() > SIGNIFICANT, f"declares to be biased across jumps, but {detail} is {z.max():.1f} standard errors"
-        )
+        require(z.max() > Z_LIMIT, f"declares to be biased across jumps, but {detail} is {z.max():.1f} standard errors")
         details.append(detail)
     return ", ".join(details)
 
@@ -374,7 +372,7 @@ def bias_under_every_design(estimator: Estimator) -> str:
             z, bias = _beyond_errors(method, oracle, _designed_noise(count, oracle.program.n_noise, design))
             size = np.linalg.norm(bias)
             require(
-                float(z.max()) <= SIGNIFICANT,
+                float(z.max()) <= Z_LIMIT,
                 f"is biased with {identity(method.name, given)}: by {size:.3g}, {z.max():.1f} standard errors, on {oracle.label}: "
                 "a variance, quantile or baseline must use whole units of design(), or needs_independent_samples = True",
             )
@@ -400,7 +398,7 @@ def _verify_bias(estimator: Estimator, candidates: list[Oracle]) -> str:
         z, bias = _standard_errors(estimator, oracle, count, repeats)
         size, norm, errors = np.linalg.norm(bias), np.linalg.norm(target(estimator, oracle)), float(z.max())
         require(
-            errors <= SIGNIFICANT or (size < norm and not estimator.unbiased),
+            errors <= Z_LIMIT or (size < norm and not estimator.unbiased),
             f"declares to be {'unbiased' * estimator.unbiased or 'biased'}, but the bias at {count} samples on {oracle.label} is "
             f"{size:.3g}, {errors:.1f} standard errors, of a gradient of {norm:.3g}: look for a wrong sign or scale; if it is "
             "meant, name this check in expected_failures",

@@ -16,7 +16,7 @@ from bench.conformance.subjects import (
     N_COLUMNS,
     ROUNDED,
     SAME,
-    SIGNIFICANT,
+    Z_LIMIT,
     able_backend,
     agree,
     available,
@@ -194,7 +194,7 @@ def closed_form_is_right(scene: Scene) -> str:
             mean, error = _sampled_gradient(program)
             z = float(standard_errors(mean - closed, error, DIFFERENCED * (1 + np.abs(closed))).max())
             detail = f"{describe(program)}, sigma = {sigma:g}: {z:.1f} standard errors from the sampled gradient"
-            require(z < SIGNIFICANT, detail)
+            require(z < Z_LIMIT, detail)
             worst, count = max(worst, z), count + 1
     skip_unless(count, "has none")
     return f"{count} programs, at most {worst:.1f} standard errors from sampling"
@@ -242,8 +242,7 @@ def score_gives_the_gradient(scene: Scene) -> str:
     size = DIFFERENCED * (1 + np.abs(problem.grad(theta, w[:, :1])).max())
     z = float(standard_errors(mean, error, size).max())
     require(
-        z < SIGNIFICANT,
-        f"{describe(program)}: E[cost score] is {z:.1f} standard errors from the mean gradient of the cost",
+        z < Z_LIMIT, f"{describe(program)}: E[cost score] is {z:.1f} standard errors from the mean gradient of the cost"
     )
     return f"{z:.1f} standard errors from differences"
 

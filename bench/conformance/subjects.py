@@ -34,7 +34,7 @@ from bench.model import (
     registry,
 )
 
-SIGNIFICANT = 4.5
+Z_LIMIT = 4.5
 """Allowed difference of a sample mean from its expectation, in standard errors."""
 ROUNDED = 1e-12
 """Relative difference allowed between numbers from the same few operations: a vectorised function may round differently
