@@ -20,7 +20,6 @@ from bench.measure import performance
 from bench.measure.statistics import ends
 from bench.report.problems import problem_names, titled
 from bench.report.views import arrange, attempted, estimator_labels
-from bench.report.writer import LEAST
 
 from .. import PARTS
 
@@ -105,14 +104,9 @@ class RunSet:
         return dict(best[~best.index.duplicated()])
 
     @cached_property
-    def scored(self) -> pd.DataFrame:
-        """The rows without the tuning seeds."""
-        return self.rows[~self.rows["seed"].isin(self.tuning_seeds)]
-
-    @cached_property
     def best_runs(self) -> pd.DataFrame:
-        """The rows that score of each method's best tuning on each problem."""
-        rows = self.scored
+        """The rows of each method's best tuning on each problem, without the tuning seeds."""
+        rows = self.rows[~self.rows["seed"].isin(self.tuning_seeds)]
         best = pd.MultiIndex.from_frame(rows[["problem", "method"]]).map(self.best_tunings)
         return rows[rows["tuning"] == best]
 
@@ -417,24 +411,24 @@ def charts(runs: RunSet) -> list[Chart]:
     frame = times.assign(share=weight).sort_values("spent", kind="stable")
     starts = frame.drop_duplicates("method").assign(share=0.0, spent=frame["spent"].min())
     frame = pd.concat([starts, frame.assign(share=frame.groupby("method")["share"].cumsum())])
-    share = Column("share", label="share of targets reached", format="percent", log=False)
     runtimes = Chart(
         "runtimes",
         frame,
         [Column("spent", label="rollouts", log=True)],
-        [share],
+        [Column("share", label="share of targets reached", format="percent", log=False)],
         series="method",
         steps=True,
         title="In how many rollouts does each method reach its targets?",
         subtitle=f"{where}, single searches, a gradient counts as its time in rollouts",
     )
-    swept = [axis for axis in runs.tuned if runs.rows[axis.column].nunique() >= LEAST]
+    # two values make no curve
+    swept = [axis for axis in runs.tuned if runs.rows[axis.column].nunique() > 2]
     return [_along(runs, swept[0], where) if len(swept) == 1 else targets, runtimes]
 
 
 def _along(runs: RunSet, axis: Axis, where: str) -> Chart:
     """Return the score of each method along a parameter of the optimizers."""
-    groups = runs.scored.dropna(subset="score").groupby(["method", axis.column], sort=False)
+    groups = runs.rows.dropna(subset="score").groupby(["method", axis.column], sort=False)
     lines = [{"method": name, axis.column: x, **ends("score", _score(runs, part))} for (name, x), part in groups]
     return Chart(
         "tunings",
@@ -442,6 +436,5 @@ def _along(runs: RunSet, axis: Axis, where: str) -> Chart:
         [setting(axis.column, label=axis.title, log=True)],
         [replace(SCORE, label="share of the way to the lowest cost known")],
         series="method",
-        title=f"How much does {axis.short} decide?",
         subtitle=f"{where} with the same {axis.short}, interquartile mean of searches",
     )
