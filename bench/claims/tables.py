@@ -66,7 +66,7 @@ def chart(claim: type[Claim], result: ClaimResult) -> Chart | None:
                     "series": label,
                     "x": places,
                     "y": values[0],
-                    "low": np.maximum(low, 0.1 * values[0]) if is_log["y"] else low,
+                    "low": low,
                     "high": high,
                 }
             )

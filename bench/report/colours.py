@@ -21,19 +21,23 @@ BESIDE = (7, 4, 3, 2, 1, 6, 5, 0)
 
 
 def looks_by_name(charts: Sequence[Chart]) -> dict[str, Style]:
-    """Return the look of each series or level of some charts; those without a given style get a free colour each, in order."""
-    given = {name: style for chart in charts for name, style in chart.styles.items()}
+    """Return the look of each series or level of some charts: a given one, that of its method, or a free colour each, in order."""
     columns = [(chart, chart.level if chart.kind == "grid" else chart.series) for chart in charts]
-    drawn = [str(name) for chart, column in columns for name in (chart.frame[column].unique() if column else [""])]
+    names = (name for chart, column in columns for name in (chart.frame[column].unique() if column else [""]))
+    drawn = dict.fromkeys(map(str, names))
+    methods = {*order_of("estimators"), *searches()}
+    given = method_styles(name for name in drawn if _plugin(name) in methods)
+    given |= {name: style for chart in charts for name, style in chart.styles.items()}
     taken = {style.colour for style in given.values()}
     free = (place for place in count() if colour(place) not in taken)
-    others = (name for name in dict.fromkeys(drawn) if name not in given)
-    found = given | {name: _look(place) for name, place in zip(others, free, strict=False)}
+    others = (name for name in drawn if name not in given)
+    found = given | {name: Style(colour(i), marker(i)) for name, i in zip(others, free, strict=False)}
     return {name: style for name, style in found.items() if name in drawn}
 
 
-def _look(place: int) -> Style:
-    return Style(colour(place), marker(place))
+def _plugin(method: str) -> str:
+    """Return the name of the estimator or search of a method."""
+    return re.split(r"[\[, ]", method)[0]
 
 
 def graded(
@@ -68,7 +72,7 @@ def method_styles(methods: Iterable[str]) -> dict[str, Style]:
     looks: dict[str, Style] = {}
     uses: Counter[str] = Counter()
     for method in sorted(methods, key=lambda name: "[" in name):
-        estimator = re.split(r"[\[, ]", method)[0]
+        estimator = _plugin(method)
         looks[method] = estimator_style(estimator, uses[estimator])
         uses[estimator] += 1
     return looks

@@ -301,7 +301,7 @@ def _draw_lines(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str,
         points = points.sort_values(x.name, kind="stable") if is_line and is_number else points
         mark = style.marker if not is_line or len(points) <= MANY or style.line == "none" else ""
         # marks on top of each other are all seen
-        shift = BESIDE * (order - (len(groups) - 1) / 2) * (is_line and not chart.line and mark != "")
+        shift = BESIDE * (order - (len(groups) - 1) / 2) * (is_line and not (chart.line or chart.band) and mark != "")
         _draw_values(chart, panel, points, y, log, points[x.name].to_numpy(), style, mark, shift)
 
 

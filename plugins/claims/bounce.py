@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from bench.claims import Claim, Figure, Outcome
@@ -79,8 +77,8 @@ class PenaltyPhase(Claim):
         """Compute the root mean square error over 256 starts within the distance of one step."""
         stiffnesses = [1e2, 1e3, 1e4, 1e5]
         figures, series = [], {"stiffness times step [N s/m]": np.geomspace(1e2, 1e7, 6) / 48000}
-        coarse, fine = ("0.020", "0.439", "2.37", "55.5"), ("2.3e-4", "0.0046", "0.0199", "0.391")
-        for parts, published in ((480, coarse), (48000, fine)):
+        printed = {480: ("0.020", "0.439", "2.37", "55.5"), 48000: ("2.3e-4", "0.0046", "0.0199", "0.391")}
+        for parts, published in printed.items():
             errors = []
             heights = 1.0 + 2.0 / parts * np.arange(256) / 256
             for k, text in zip(stiffnesses, published, strict=True):
@@ -90,5 +88,5 @@ class PenaltyPhase(Claim):
                 errors.append(float(np.sqrt(np.mean((slope + 1) ** 2))))
                 figures.append(Figure(f"k = {k:g}, dt = 1/{parts}", text, errors[-1]))
             # a hundredth of the step has the same places at a hundred times the stiffness
-            series[f"dt = 1/{parts} s"] = np.roll([*errors, math.nan, math.nan], 2 * (parts == 480))
+            series[f"dt = 1/{parts} s"] = np.roll([*errors, np.nan, np.nan], 2 * (parts == 480))
         return Outcome(figures, series=series)

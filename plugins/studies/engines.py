@@ -280,7 +280,7 @@ def _chart(measured: pd.DataFrame) -> Chart:
     rigid = (measured["contact"] == "impulse") & (measured["contact"].nunique() > 1)
     letters = measured["level"].map({name: style.meaning[0] for name, style in LEVELS.items()})
     errors = (" " + measured["model_error_rel"].map(number)).mask(measured["level"] == "none", "")
-    frame = measured.assign(place=measured["scene"] + rigid.map({True: ", rigid", False: ""}), cell=letters + errors)
+    frame = measured.assign(place=measured["scene"] + np.where(rigid, ", rigid", ""), cell=letters + errors)
     return Chart(
         "engines",
         frame,
@@ -290,7 +290,6 @@ def _chart(measured: pd.DataFrame) -> Chart:
         level="level",
         cell="cell",
         styles=LEVELS,
-        across=1,
         subtitle="number: relative distance from the model's gradient; rigid: with the law impulse",
         failed_name="not supported",
     )

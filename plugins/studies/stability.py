@@ -452,13 +452,6 @@ def shares_of(cells: pd.DataFrame) -> pd.DataFrame:
     return shares.iloc[order].reset_index(drop=True)
 
 
-SHOWN = {
-    "step": "Each contact law is drawn with the integrator that is most often right",
-    "integrator": "Beside the limit a small error may be a coincidence of the phase",
-}
-"""What the subtitle of a map says of its panels."""
-
-
 def charts(cells: pd.DataFrame, limit: float) -> list[Chart]:
     """Return a map per scene, of the first variant of each law and integrator; of several laws, each with its best integrator."""
     from bench.report.colours import graded
@@ -467,8 +460,7 @@ def charts(cells: pd.DataFrame, limit: float) -> list[Chart]:
 
     every = sorted(cells["stiffness"].dropna().unique()) or [math.nan]
     # a law without stiffness is the same at each one
-    is_free = cells["stiffness"].isna()
-    frame = cells.assign(stiffness=[[k] if k == k else every for k in cells["stiffness"]], is_free=is_free)
+    frame = cells.assign(stiffness=[[k] if k == k else every for k in cells["stiffness"]])
     frame = frame.explode("stiffness", ignore_index=True).astype({"stiffness": float})
     worst = frame["relative_error"].fillna(math.inf).where(frame["level"] != "open", -1.0)
     frame = frame.iloc[worst.argsort(kind="stable")[::-1]].drop_duplicates(["problem", "dt", "stiffness"]).sort_index()
@@ -483,8 +475,9 @@ def charts(cells: pd.DataFrame, limit: float) -> list[Chart]:
     ]
     found: list[Chart] = []
     for scene, part in frame.groupby("scene_name", sort=False):
-        panel = "step" if part["contact"].nunique() > 1 else "integrator"
-        if panel == "step":
+        panel, note = "integrator", "Beside the limit a small error may be a coincidence of the phase"
+        if part["contact"].nunique() > 1:
+            panel, note = "step", "Each contact law is drawn with the integrator that is most often right"
             right = (part["level"] == "right").groupby(part["step"]).transform("mean")
             best = part.loc[right.sort_values(ascending=False, kind="stable").index].drop_duplicates("contact")
             part = part[part["step"].isin(best["step"])]
@@ -502,9 +495,9 @@ def charts(cells: pd.DataFrame, limit: float) -> list[Chart]:
                 cell="cell",
                 limit="stiffness_limit",
                 limit_name="stability limit of the step in theory",
-                panel_notes=dict.fromkeys(part.loc[part["is_free"], panel], "the same at any stiffness"),
+                panel_notes=dict.fromkeys(cells["step"][cells["stiffness"].isna()], "the same at any stiffness"),
                 subtitle=f"{name}. Number: error of the gradient, in % of the true one. Near 0: gradient and error are below {100 * limit:g}% "
-                f"of the scene's largest gradient. The worst of all backends. {SHOWN[panel]}",
+                f"of the scene's largest gradient. The worst of all backends. {note}",
             )
         )
     return found

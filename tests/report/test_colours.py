@@ -89,7 +89,6 @@ def test_a_name_has_one_colour_in_all_charts_of_an_experiment():
             "points",
             series="name",
             title=str(turn),
-            styles=method_styles(["fobg, adam"]),
         )
         for turn in range(3)
     ]

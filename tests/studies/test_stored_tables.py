@@ -10,6 +10,7 @@ from helpers import stored
 from numpy.linalg import norm
 from trees import ROOT
 
+from bench.experiment import config
 from bench.experiment.columns import COMMON
 from bench.report.draw import BOLD, WIDTH
 from bench.report.finish import views_of
@@ -70,7 +71,7 @@ def test_tables_of_stored_rows_are_the_stored_tables(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_the_title_of_an_experiment_is_one_question_in_one_line(name):
     """A title of two lines asked two questions, and no row of its chart answered the second."""
-    title = stored(name, *NAMES[name])[0].question
+    title = config.load([f"experiment={name}", *NAMES[name]]).question
     assert title.count("?") == title.endswith("?") == 1
     assert "\n" not in filled(title, 0.97 * WIDTH / BOLD)
 

@@ -11,7 +11,6 @@ from bench.experiment.axes import table as csv_table
 from bench.experiment.columns import Column, interval, setting, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Mark, Style, Table, Views
-from bench.report.colours import method_styles
 from bench.report.names import short_names
 from bench.report.style import PALETTE
 
@@ -23,16 +22,12 @@ VERDICTS = {
     "below 1": Style(PALETTE[0], "s", meaning="takes fewer for certain"),
     "not known": Style("#767676", meaning="not known: the interval includes 1"),
 }
-CLASS, PROBLEMS, SCENES = (
-    text("scene_class", label="class"),
-    setting("problems"),
-    setting("scenes"),
-)
+CLASS = text("scene_class", label="class")
 PAIRS = (
     CLASS,
     text("comparison"),
-    PROBLEMS,
-    SCENES,
+    setting("problems"),
+    setting("scenes"),
     setting("above", label="above 1"),
     interval("ratio", boundary=1.0),
     text("verdict"),
@@ -158,9 +153,7 @@ def _reached(known: pd.DataFrame) -> Table:
 
 
 def _reached_chart(known: pd.DataFrame) -> Chart:
-    looks = method_styles(dict.fromkeys(known["method"])) | {
-        BEST: Style("#767676", meaning=f"{BEST}: without noise; where the cost jumps, a mean of rollouts")
-    }
+    best = Style("#767676", meaning=f"{BEST}: without noise; where the cost jumps, a mean of rollouts")
     most = known.groupby("problem")["rollouts_per_update"].transform("max")
     names = known["problem"].map(short_names(known["problem"])) + most.map(" ({:,.0f})".format)
     return Chart(
@@ -179,7 +172,7 @@ def _reached_chart(known: pd.DataFrame) -> Chart:
         [text("problem", label="")],
         "dots",
         series="method",
-        styles=looks,
+        styles={BEST: best},
         failed="missed",
         failed_name="most searches miss it",
         subtitle=f"to 1/{MAIN:g} of the first regret at each method's best rate, median of searches, a gradient counted as a rollout; in brackets the rollouts of an update without gradients",

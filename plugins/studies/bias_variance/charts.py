@@ -94,10 +94,7 @@ def charts(
     is_grid = (methods[["setting", "estimator"]].nunique() > 1).all()
     if max(swept.values(), default=0) < LEAST and is_grid:
         along = [_estimators(methods), *along]
-    drawn = [*filter(None, along)]
-    names = [name for chart in drawn for name in chart.frame["series"]]
-    styles = method_styles(dict.fromkeys([*labelled.rows["series"], *names]))
-    return [chart if chart.styles else replace(chart, styles=styles) for chart in drawn]
+    return [*filter(None, along)]
 
 
 # ------------------------------------------------------------------------------------------------------- frames
@@ -373,21 +370,18 @@ def _estimators(methods: pd.DataFrame) -> Chart:
     """Return the heat table of errors: estimators by their worst case, in families, against problems."""
     # of an axis the first value is shown
     methods = methods.drop_duplicates(["estimator", "problem"])
-    worst = methods["error"].where(methods["status"] == "ok", math.inf)
-    names = worst.groupby(methods["estimator"], sort=False).max().sort_values(kind="stable").index
-    families = {name: _family(name.partition("[")[0]) for name in names}
-    order = sorted(names, key=lambda name: list(dict.fromkeys(families.values())).index(families[name]))
-    frame = methods.iloc[methods["estimator"].map(order.index).argsort(kind="stable")]
+    worst = methods["error"].where(methods["status"] == "ok", math.inf).groupby(methods["estimator"]).transform("max")
+    frame = methods.loc[worst.sort_values(kind="stable").index]
     axis, at = frame[["axis", "at"]].iloc[0]
     error, known = frame["error"], np.isfinite(frame["error"])
     marks = frame["status"].where(frame["verdict"] == NO_RESULT, "").mask(frame["verdict"] == FAILS, " fails")
-    at_equal = f"{axis} {axis_value(at)}" if axis not in ("", "rollouts") else ""
+    at_equal = setting(axis, axis_value(at)) if axis not in ("", "rollouts") else ""
     spent = " to ".join(dict.fromkeys(map(axis_value, methods["rollouts"].agg(["min", "max"]).round())))
     grades, looks = graded(error.map(rounded), GRADES, "error {}".format, "{:g}".format)
     return Chart(
         "estimators",
         frame.assign(
-            panel=frame["estimator"].map(families),
+            panel=[_family(name.partition("[")[0]) for name in frame["estimator"]],
             series=frame["estimator"],
             grade=grades.where(known, "no result"),
             cell=(frame["error_is_limit"].map({True: "<"}).fillna("") + error.map(number)).where(known, marks),

@@ -18,10 +18,8 @@ from bench.experiment.views import Chart, Table, Views
 from bench.host.parameters import remember
 from bench.measure import performance
 from bench.measure.statistics import ends
-from bench.report.colours import method_styles
 from bench.report.problems import problem_names, titled
 from bench.report.views import arrange, attempted, estimator_labels
-from bench.report.writer import LEAST
 
 from .. import PARTS
 
@@ -40,18 +38,6 @@ REACHED = interval(
     ends="95% interval over scenes, or over seeds of one",
 )
 SCORE = interval("score", digits=3, log=False)
-BETTER = interval("improvement", label="beats fobg")
-PROFILE = Column("profile", log=False)
-MEDIAN = Column("median_score", label="median over tunings", log=False)
-RUNTIME = interval(
-    "art",
-    label="average runtime",
-    unit="rollouts",
-    log=True,
-    doc="expected rollouts per target reached: all rollouts of all searches over the searches that reached it",
-)
-RATE = interval("rate", label="searches that reach it")
-SPENT = Column("spent", label="rollouts", log=True)
 NOTE = (
     "targets reached: share of searches whose regret falls to 1/10, 1/100 and 1/1000 of the first, the mean over problems and "
     "targets. score: share of the way from the first cost to J*, interquartile mean over searches. Intervals are over scenes, "
@@ -118,14 +104,9 @@ class RunSet:
         return dict(best[~best.index.duplicated()])
 
     @cached_property
-    def scored(self) -> pd.DataFrame:
-        """The rows without the tuning seeds."""
-        return self.rows[~self.rows["seed"].isin(self.tuning_seeds)]
-
-    @cached_property
     def best_runs(self) -> pd.DataFrame:
-        """The rows that score of each method's best tuning on each problem."""
-        rows = self.scored
+        """The rows of each method's best tuning on each problem, without the tuning seeds."""
+        rows = self.rows[~self.rows["seed"].isin(self.tuning_seeds)]
         best = pd.MultiIndex.from_frame(rows[["problem", "method"]]).map(self.best_tunings)
         return rows[rows["tuning"] == best]
 
@@ -135,7 +116,11 @@ def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
     shown = arrange(experiment, rows)
     runs = attempted(shown.rows)
     runs = runs[np.isfinite(runs["start_cost"])]
-    tuned_axes = [axis for axis in shown.axes if _is_tuned(axis, runs)]
+    tuned_axes = [
+        axis
+        for axis in shown.axes
+        if any(part == "optimizer" for part, _, _ in named(runs, axis.names).dropna(axis=1, how="all"))
+    ]
     names = problem_names(shown, PARTS, tuned_axes, rows=runs).astype(str)
     short = {axis.column: axis.short for axis in tuned_axes}
     tuning = titled(runs[[*short]].rename(columns=short), [*short.values()])
@@ -147,12 +132,6 @@ def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
     score = ((start - final) / achievable).clip(0.0, 1.0).mask(runs["status"] != "ok", 0.0)
     ratio = runs.groupby("problem")["gradient_ratio"].transform("median").fillna(experiment.study.gradient_cost)
     return RunSet(runs.assign(best_known=best_known, best_known_status=status, score=score, ratio=ratio), tuned_axes)
-
-
-def _is_tuned(axis: Axis, rows: pd.DataFrame) -> bool:
-    """Return whether an axis sweeps a parameter of an optimizer."""
-    found = named(rows, axis.names)
-    return bool(found[[place for place in found if place[0] == "optimizer"]].notna().any(axis=None))
 
 
 def _best_known_cost(rows: pd.DataFrame) -> tuple[pd.Series, pd.Series]:
@@ -357,10 +336,10 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet) -> list[Tab
                 REACHED,
                 text("verdict"),
                 SCORE,
-                BETTER,
-                PROFILE,
+                interval("improvement", label="beats fobg"),
+                Column("profile", log=False),
                 *(setting(name) for name in ("tunings", "searches", "diverged")),
-                MEDIAN,
+                Column("median_score", label="median over tunings", log=False),
             ],
             "methods by the share of targets they reach",
             [NOTE.format(seeds=seeds)],
@@ -371,7 +350,20 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet) -> list[Tab
         Table(
             "optimise",
             reached.assign(regret=[f"1/{t:g}" for t in reached["target"]]),
-            [PROBLEM, METHOD, text("tuning"), text("regret"), RATE, RUNTIME],
+            [
+                PROBLEM,
+                METHOD,
+                text("tuning"),
+                text("regret"),
+                interval("rate", label="searches that reach it"),
+                interval(
+                    "art",
+                    label="average runtime",
+                    unit="rollouts",
+                    log=True,
+                    doc="expected rollouts per target reached: all rollouts of all searches over the searches that reached it",
+                ),
+            ],
             "Times to targets",
             terminal=True,
         ),
@@ -403,7 +395,6 @@ def charts(runs: RunSet) -> list[Chart]:
     """
     problems, times = runs.rows["problem"].unique(), hits(runs)
     where = f"{len(problems)} problems" if len(problems) > 1 else problems[0]
-    looks = method_styles(runs.rows["method"].unique())
     targets = Chart(
         "targets",
         summarise(runs).sort_values("reached", ascending=False, kind="stable"),
@@ -411,7 +402,6 @@ def charts(runs: RunSet) -> list[Chart]:
         [METHOD],
         "dots",
         series="method",
-        styles=looks,
         title="Which method reaches most targets?",
         subtitle=f"{where}, targets: a tenth, a hundredth and a thousandth of the first regret",
     )
@@ -421,25 +411,24 @@ def charts(runs: RunSet) -> list[Chart]:
     frame = times.assign(share=weight).sort_values("spent", kind="stable")
     starts = frame.drop_duplicates("method").assign(share=0.0, spent=frame["spent"].min())
     frame = pd.concat([starts, frame.assign(share=frame.groupby("method")["share"].cumsum())])
-    share = Column("share", label="share of targets reached", format="percent", log=False)
     runtimes = Chart(
         "runtimes",
         frame,
-        [SPENT],
-        [share],
+        [Column("spent", label="rollouts", log=True)],
+        [Column("share", label="share of targets reached", format="percent", log=False)],
         series="method",
-        styles=looks,
         steps=True,
         title="In how many rollouts does each method reach its targets?",
         subtitle=f"{where}, single searches, a gradient counts as its time in rollouts",
     )
-    swept = [axis for axis in runs.tuned if runs.rows[axis.column].nunique() >= LEAST]
+    # two values make no curve
+    swept = [axis for axis in runs.tuned if runs.rows[axis.column].nunique() > 2]
     return [_along(runs, swept[0], where) if len(swept) == 1 else targets, runtimes]
 
 
 def _along(runs: RunSet, axis: Axis, where: str) -> Chart:
     """Return the score of each method along a parameter of the optimizers."""
-    groups = runs.scored.dropna(subset="score").groupby(["method", axis.column], sort=False)
+    groups = runs.rows.dropna(subset="score").groupby(["method", axis.column], sort=False)
     lines = [{"method": name, axis.column: x, **ends("score", _score(runs, part))} for (name, x), part in groups]
     return Chart(
         "tunings",
@@ -447,7 +436,5 @@ def _along(runs: RunSet, axis: Axis, where: str) -> Chart:
         [setting(axis.column, label=axis.title, log=True)],
         [replace(SCORE, label="share of the way to the lowest cost known")],
         series="method",
-        styles=method_styles(runs.rows["method"].unique()),
-        title=f"How much does {axis.short} decide?",
         subtitle=f"{where} with the same {axis.short}, interquartile mean of searches",
     )

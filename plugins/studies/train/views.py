@@ -17,7 +17,6 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Table, Views
 from bench.measure.performance import bootstrap, interquartile_mean
 from bench.measure.statistics import ends
-from bench.report.colours import method_styles
 from bench.report.problems import problem_names
 from bench.report.views import arrange, attempted
 
@@ -388,4 +387,4 @@ def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
         title="What does the length of a window do?",
         subtitle=f"after training; {middles}",
     )
-    return [replace(one, styles=method_styles(one.frame[one.series].unique())) for one in (curves, times, lengths)]
+    return [curves, times, lengths]
