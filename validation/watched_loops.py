@@ -18,6 +18,7 @@ from simulators import fall
 import bench
 
 DETACHED, UNSTABLE, UPDATES, HORIZON = 200, 500, 600, 32
+"""Updates from which on there is a fault, updates of a run, and steps of one update of APG."""
 CHANGED = {
     "  loss_grad = jax.grad(loss, has_aux=True)\n": """\
   loss_grad = jax.grad(loss, has_aux=True)
@@ -74,12 +75,11 @@ def brax(new_watch, seed, fault):
 
     source = inspect.getsource(train)
     for old, new in CHANGED.items():
-        assert source.count(old) == 1, old
+        assert source.count(old) == 1
         source = source.replace(old, new)
     exec(source, space := {"__name__": "apg", "new_watch": new_watch})
     env = Planted(envs.get_environment("reacher", backend="spring"))
-    words = {"horizon_length": HORIZON, "num_envs": 4, "learning_rate": 1e-3, "seed": seed}
-    return jax.tree.leaves(space["train"](env, 100, UPDATES, **words)[1])
+    return jax.tree.leaves(space["train"](env, 100, UPDATES, num_envs=4, learning_rate=1e-3, seed=seed)[1])
 
 
 def torch(new_watch, seed, fault):
@@ -88,7 +88,7 @@ def torch(new_watch, seed, fault):
 
     torch.manual_seed(seed)
     theta = torch.nn.Parameter(torch.tensor([0.3, -1.0]).double() + 0.1 * torch.randn(2))
-    optimizer, update = torch.optim.Adam([theta], lr=3e-4), 0
+    optimizer = torch.optim.Adam([theta], lr=3e-4)
 
     def cost(theta):
         cut = torch.detach if fault == "detached" and update >= DETACHED else torch.clone
@@ -117,7 +117,7 @@ def report(name, seed, fault):
     both = LOOPS[name](new_watch, seed, fault), LOOPS[name](lambda cost: lambda *given: None, seed, fault)
     _, second, *others = (row["seconds"] for row in logs[0].rows)
     share = sum(others) / (calls[-1] - calls[0] - second)
-    is_same = all(map(np.array_equal, *both))
+    is_same = all(np.array_equal(*pair, equal_nan=True) for pair in zip(*both, strict=True))
     print(f"{name} {fault or 'sound'} {seed}: {logs[0]}; {share:.1%} of the time, same theta: {is_same}")
 
 

@@ -186,9 +186,12 @@ def test_a_return_above_another_by_less_than_noise_is_not_behind():
     best = np.array([-8.0, -7.0, -9.0, -8.5, -7.5])
     lines = pd.DataFrame({"final": [-9.0, -8.0], "returns": [best - 0.6, best], "group": "one", "family": ["a", "b"]})
     lines = lines.assign(failed=0, seeds=5, tuned=0.0)
-    assert studied.ranked(lines, ["group"]).tolist() == ["open", "open"]
+    assert studied.ranked(lines, ["group"])["verdict"].tolist() == ["open", "open"]
     # the intervals of a few seeds may overlap where a test of the difference finds one
-    assert studied.ranked(lines.assign(returns=[best - 1.9, best]), ["group"]).tolist() == ["behind", "first"]
+    found = studied.ranked(lines.assign(returns=[best - 1.9, best]), ["group"])
+    assert found["verdict"].tolist() == ["behind", "first"]
+    assert found["behind"][0] == pytest.approx(1.9)
+    assert found["behind_low"][0] < 1.9 < found["behind_high"][0]
 
 
 @pytest.mark.parametrize(

@@ -33,10 +33,10 @@ SUMMARY = (
     PROBLEM,
     METHOD,
     FINAL,
+    interval("behind", label="behind the first", digits=3, log=False),
     VERDICT,
     setting("settings"),
     Column("tuned", label="at the choosing seeds", digits=3, log=False),
-    Column("worst", label="worst seed", digits=3),
     setting("seeds"),
     setting("failed", label="not finite"),
     Column("steps", unit="steps", label="control steps", digits=3),
@@ -77,7 +77,7 @@ STEP, TIME = (
 SEEDS = f"interquartile mean over seeds, with its 95% bootstrap interval from {MIN_SEEDS} seeds on"
 NOTE = (
     f"final return: the mean undiscounted return of the deterministic policy from the same starts, {SEEDS}. A run that is not "
-    "finite counts as its untrained policy. used steps: control steps that updates use, median. at equal used steps: the return at "
+    "finite counts as its untrained policy. behind the first: the difference of both means, with its 95% bootstrap interval. used steps: control steps that updates use, median. at equal used steps: the return at "
     "the last evaluation within the used steps of the run that used fewest. training: "
     "median over seeds, without compilation and evaluations. gradient norm: median over updates before clipping, of the "
     "trainer's own objective, so compare it within a trainer only. cosine: between first- and zeroth-order gradients of the "
@@ -173,7 +173,6 @@ def summarise(runs: pd.DataFrame, by: Sequence[str] = ("problem", "method")) -> 
                 "failed": int((part["status"] != "ok").sum()),
                 "returns": final,
                 **middle_with_interval("final", final),
-                "worst": float(final.min()),
                 "steps": float(part["steps"].max()),
                 "used": float(part["used"].median()),
                 **middle_with_interval("equal", equal),
@@ -219,8 +218,10 @@ def tried(lines: pd.DataFrame, tuning: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def ranked(lines: pd.DataFrame, by: Sequence[str], trainer: str = "family") -> pd.Series:
-    """Return a verdict on each line, within groups ``by``, of which a trainer's setting with the best ``tuned`` counts.
+def ranked(lines: pd.DataFrame, by: Sequence[str], trainer: str = "family") -> pd.DataFrame:
+    """Return a ``verdict`` on each line, within groups ``by``, of which a trainer's setting with the best ``tuned`` counts.
+
+    ``behind`` is how much higher the first of its group ends than such a setting, with its interval.
 
     ``first``: the highest return; ``behind``: its runs end lower than those of the first, by the test of Mann and Whitney (1947)
     at 5%, even if the first had only its worst settings, as many as this one; ``tied``: the test finds no difference;
@@ -228,6 +229,7 @@ def ranked(lines: pd.DataFrame, by: Sequence[str], trainer: str = "family") -> p
     ``no result``: no run ended with a finite return.
     """
     verdicts = pd.Series("no result", lines.index, dtype=object)
+    behind: dict[Any, dict[str, Any]] = {}
     is_run, has_ended = lines["seeds"] > 0, np.isfinite(lines["final"]) & (lines["failed"] < lines["seeds"])
     compared = lines[has_ended | ~is_run].sort_values("tuned", ascending=False, kind="stable", na_position="last")
     for _, part in compared.groupby(list(by), sort=False):
@@ -244,10 +246,12 @@ def ranked(lines: pd.DataFrame, by: Sequence[str], trainer: str = "family") -> p
             leads = is_lower(line["returns"], best["returns"])
             leads_by_fewer = isinstance(fewest, np.ndarray) and is_lower(line["returns"], fewest)
             verdicts[index] = ("behind" if leads_by_fewer else "open") if leads else "tied"
+            behind[index] = middle_with_interval("behind", line["returns"], best["returns"])
+        del behind[best.name]
         verdicts[best.name] = "first"
         if len(chosen) > 1 and not (verdicts[chosen.index] == "behind").any():
             verdicts[chosen.index] = "open"
-    return verdicts
+    return pd.DataFrame({"verdict": verdicts}).join(pd.DataFrame(behind, index=ends("behind", "123")).T.astype(float))
 
 
 def is_lower(returns: np.ndarray, others: np.ndarray) -> bool:
@@ -260,12 +264,21 @@ def is_lower(returns: np.ndarray, others: np.ndarray) -> bool:
     return bool(len(returns) >= MIN_SEEDS and test.pvalue < 0.05 and is_above)
 
 
-def middle_with_interval(name: str, values: np.ndarray) -> dict[str, Any]:
-    """Return interquartile means over the first axis and their bootstrap intervals by column, of fewer than :data:`MIN_SEEDS` NaN."""
+def middle_with_interval(name: str, values: np.ndarray, *above: np.ndarray) -> dict[str, Any]:
+    """Return interquartile means over the first axis, or their distances below those ``above``, with bootstrap intervals by column.
+
+    Of fewer than :data:`MIN_SEEDS` the interval is NaN.
+    """
+
+    def distance(parts: Sequence[np.ndarray]) -> Any:
+        own, *others = map(interquartile_mean, parts)
+        return others[0] - own if others else own
+
+    parts = [values, *above]
     low = high = np.full(values.shape[1:], math.nan)[()]
-    if len(values) >= MIN_SEEDS:
-        low, high = bootstrap([values], lambda drawn: interquartile_mean(drawn[0]))
-    return ends(name, (interquartile_mean(values), low, high))
+    if min(map(len, parts)) >= MIN_SEEDS:
+        low, high = bootstrap(parts, distance)
+    return ends(name, (distance(parts), low, high))
 
 
 def curves_of(runs: pd.DataFrame) -> pd.DataFrame:
@@ -314,7 +327,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
         return None
     tuning, reported = split(runs)
     summary, windows, faults = tried(summarise(reported), tuning), windows_of(runs), faults_of(runs)
-    summary = summary.assign(verdict=ranked(summary, ["problem"])).drop(columns=["returns", *OF_WINDOWS])
+    summary = summary.join(ranked(summary, ["problem"])).drop(columns=["returns", *OF_WINDOWS])
     chosen = summary[~summary["verdict"].isin(["not chosen", "not run"])].set_index(["problem", "method"]).index
     shown = reported[pd.MultiIndex.from_frame(reported[["problem", "method"]]).isin(chosen)]
     tables = [
@@ -332,8 +345,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
         Table("summary", summary),
     ]
     if len(windows):
-        verdicts = ranked(windows.assign(tuned=0.0), ["problem", "family"], "window")
-        lines = windows.assign(verdict=verdicts).drop(columns=["returns", "failed"])
+        lines = windows.join(ranked(windows.assign(tuned=0.0), ["problem", "family"], "window"))
+        lines = lines.drop(columns=["returns", "failed"])
         tables.append(
             Table(
                 "windows",
