@@ -44,7 +44,7 @@ DIFFERENCED, SAME = 4, 1e-3
 """Most components at which differences are compared with a wrong gradient, and the largest part of its error that is left."""
 DIFFERENCE_STEPS = 10.0 ** -np.arange(1.0, 9.0)
 """Steps of these differences, in units of max(1, |x|)."""
-BESIDE, MOST_ROWS = 1e-3, 64
+BESIDE, MOST_ROWS = 1e-5, 64
 """Spacing of the thetas at which the noise of a gradient is measured, in units of each input's scale, and most numbers of it."""
 LOOSE, MOST_OF_IT, REFINED = 0.01, 0.6, 10.0
 """Relative error of a difference that shows too little, largest share of the remaining calls for a component's smooth part,

@@ -425,7 +425,12 @@ class Findings:
         yield "nondeterministic", repeats.is_failing, "equal calls raise an exception or return a number"
         yield "raised", self.is_failed, shortened(self.error)
         yield "undecided", not self.check.parts, self.n_checked
-        yield "nondeterministic", repeats.is_large, self.spread_text
+        is_noisy = repeats.spread > repeats.floor and not repeats.has_state
+        yield "nondeterministic", repeats.is_large and not is_noisy, self.spread_text
+        known = [part.uncertainty / abs(part.difference) for part in self.settled.components if part.difference]
+        limit = f", and differences are known to {number(100 * min(known, default=math.inf))}% at best"
+        is_hidden = repeats.is_large_of_gradient or self.settled.cause not in UNEQUAL
+        yield "noisy", is_noisy and is_hidden, self.spread_text + limit
         if self.wrong_checks:
             yield from self._verdicts_on_failed(self.wrong_checks[0].cause)
         yield from self._verdicts_on_passed()

@@ -7,6 +7,7 @@ loops all have fixed lengths has no such excuse.
 from __future__ import annotations
 
 import ast
+import inspect
 import itertools
 import linecache
 import sys
@@ -24,13 +25,14 @@ SKIPPED = tuple(
     f"/{name}/" for name in ("jax", "jaxlib", "torch", "numpy", "bench/model", "bench/gradient", "bench/examine")
 )
 """Folders whose loops are those of a library, not of the program."""
+LOOPS = (ast.For, ast.While, ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 
 
 def changing_loop(simulator: Simulator, thetas: np.ndarray, w: np.ndarray | None) -> str:
-    """Return a while loop whose length depends on theta, as ``the loop at ode.py:17``; empty where none is known.
+    """Return a loop whose length depends on theta, as ``the loop at ode.py:17``; empty where none is known.
 
     A JAX program is read: a loop that does not count to a number. Other Python code runs under a trace at
-    ``thetas (d, n)``. Loops of compiled code are not seen.
+    ``thetas (d, n)``. Loops of compiled code are seen where they call a Python function.
     """
     place = _loop_of_jax(simulator, thetas[:, 0], w)
     if place or simulator.library == "jax":
@@ -43,15 +45,24 @@ def changing_loop(simulator: Simulator, thetas: np.ndarray, w: np.ndarray | None
 
 
 def rounds_of_loops(simulator: Simulator, theta: np.ndarray, w: np.ndarray | None) -> Counter[tuple[str, int]]:
-    """Return by file and line of a while loop how often its condition is computed by one call of the cost at ``theta (d,)``.
+    """Return by file and line how often a while loop, or a function that compiled code calls, runs in a cost at ``theta (d,)``.
 
     Empty where the cost is not a number, since its loops may have been cut off.
     """
     rounds: Counter[tuple[str, int]] = Counter()
+    running: list[tuple[FrameType | None, int]] = []  # frames, each with its last instruction that entered another
 
     def enter(frame: FrameType, event: str, argument: Any) -> Any:
-        file = frame.f_code.co_filename
-        lines = set() if any(folder in file for folder in SKIPPED) else _while_loops(file)
+        file, caller = frame.f_code.co_filename, frame.f_back
+        while running and running[-1][0] is not caller:
+            running.pop()
+        if caller is not None and not frame.f_code.co_flags & inspect.CO_GENERATOR:
+            # one call of compiled code enters Python functions again and again
+            site = caller, caller.f_lasti
+            rounds[caller.f_code.co_filename, caller.f_lineno] += site in running[-1:] and _is_outside(caller)
+            running[-1:] = [site]
+        running.append((frame, -1))
+        lines = set() if _is_skipped(file) else _while_loops(file)
 
         def follow(frame: FrameType, event: str, argument: Any) -> Any:
             if event == "line" and frame.f_lineno in lines:
@@ -64,17 +75,32 @@ def rounds_of_loops(simulator: Simulator, theta: np.ndarray, w: np.ndarray | Non
     return rounds if np.isfinite(costs).all() else Counter()
 
 
+def _is_skipped(file: str) -> bool:
+    return any(folder in file for folder in SKIPPED)
+
+
+def _is_outside(frame: FrameType) -> bool:
+    """Return whether the line that a frame runs is in no loop of its file."""
+    file, line = frame.f_code.co_filename, frame.f_lineno
+    return not _is_skipped(file) and all(not loop.lineno <= line <= loop.end_lineno for loop in _loops(file))
+
+
+@cache
+def _loops(file: str) -> list[Any]:
+    try:
+        nodes = ast.walk(ast.parse("".join(linecache.getlines(file))))
+    except SyntaxError:
+        return []
+    return [node for node in nodes if isinstance(node, LOOPS)]
+
+
 @cache
 def _while_loops(file: str) -> set[int]:
     """Return the line at which each round of each while loop of a file begins.
 
     A for loop runs over a list, whose length is often the number of contacts rather than of steps.
     """
-    try:
-        nodes = ast.walk(ast.parse("".join(linecache.getlines(file))))
-    except SyntaxError:
-        return set()
-    loops = [node for node in nodes if isinstance(node, ast.While)]
+    loops = [node for node in _loops(file) if isinstance(node, ast.While)]
     # the condition of `while True` is not computed
     return {(loop.body[0] if isinstance(loop.test, ast.Constant) else loop).lineno for loop in loops}
 

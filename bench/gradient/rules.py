@@ -104,7 +104,7 @@ DERIVATIVE = {
     ),
     "nonfinite": Rule(
         "open",
-        "a cost is NaN or infinite",
+        "a cost is not a number, or raises an exception",
         "at theta, or a number at fewer than {direction.MIN_STEPS} step sizes, or under noise; in `examine` also within u^(1/3) of theta",
     ),
     "unsettled": Rule(
@@ -197,6 +197,13 @@ EXAMINATION = {
         "fault",
         "the gradient could not be computed",
         "an exception at theta",
+    ),
+    "noisy": Rule(
+        "open",
+        "the cost draws noise of its own, which hides the slope",
+        "the spread of equal calls of the cost is above u^{stages.SMALL} of it and does not come from the call before, and nothing else is wrong",
+        "fix the seed, or pass the noise as w and set noise=N",
+        EXPECTED,
     ),
     "rough": Rule(
         "fault",

@@ -43,6 +43,56 @@ def test_a_cost_that_fails_near_theta_is_reported(edge, status, cause):
     assert any("nearest at theta[0] +" in text for text in said)
 
 
+@pytest.mark.parametrize(
+    ("ending", "said"), [("raise", "diverged (test_answers.py:"), ("return", "the cost returned None")]
+)
+def test_a_note_says_where_the_users_code_failed(ending, said):
+    def failing(x):
+        if x[0] > 1.0 + 1e-6:
+            if ending == "raise":
+                raise ValueError("diverged")
+            return None
+        return cost(x)
+
+    (note,) = (line for line in str(examine(failing, THETA, grad=gradient)).splitlines() if line.startswith("note"))
+    assert said in note
+    assert "<" not in note  # no function that calls the user's
+
+
+def test_a_list_of_one_number_has_a_shape():
+    with pytest.raises(bench.UserError, match=r"has shape \(1,\), and theta"):
+        examine(cost, THETA, grad=lambda x: [1.0])
+
+
+def test_a_bias_that_is_small_enough_is_no_contradiction():
+    def noisy(x, w):
+        return [2.12 * x[0] + 0.3 * w[0], 3.0]
+
+    report = examine(lambda x, w: cost(x), THETA, grad=noisy, noise=1, calls=20_000)
+    assert report.derivative_cause == "biased"
+    assert "usable to 10%. The bias of the mean gradient is below " in report.noise_answer
+
+
+@pytest.mark.parametrize("height", [0.3, 0.8])
+def test_contacts_that_change_with_theta_are_no_noise_of_a_short_float(height):
+    """Over 4 s of bounces, each contact begins at another step for neighbouring thetas; the damper is detached."""
+
+    def bounce(x, detach=1.0):
+        q, v, dq, dv = x[0], x[1], *np.eye(2)
+        for _ in range(800):
+            depth, touches = max(-q, 0.0), q < 0.0
+            v, dv = (
+                v + 5e-3 * (-9.81 + 800.0 * depth - 4.0 * touches * v),
+                dv - 5e-3 * touches * (800.0 * dq + 4.0 * detach * dv),
+            )
+            q, dq = q + 5e-3 * v, dq + 5e-3 * dv
+        return (q - 0.2) ** 2, 2.0 * (q - 0.2) * dq
+
+    report = examine(lambda x: bounce(x)[0], [height, -0.5], grad=lambda x: bounce(x, 0.0)[1], calls=1500)
+    assert report.derivative == "wrong"
+    assert "short float" not in str(report)
+
+
 def test_sigma_by_input_is_a_range():
     report = examine(lambda x: float(x @ x), np.ones(4), grad=lambda x: 2 * x, sigma=[[0.02, 0.02, 20.0, 0.05]])
     assert "Under noise of sigma 0.020 to 20:" in report.noise_answer

@@ -6,6 +6,7 @@ from functools import partial
 import mechanisms
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 import bench
 
@@ -37,6 +38,15 @@ def single(size):
 
 def noisy(x):
     return swing(x) + 1e-7 * RANDOM.standard_normal()
+
+
+def root(x, xtol=1e-3):
+    return brentq(lambda z: z**3 + x[0] * z - x[1], -5.0, 5.0, xtol=xtol)
+
+
+def root_slope(x):
+    z = root(x)
+    return np.array([-z, 1.0]) / (3.0 * z * z + x[0])
 
 
 def hashed(x):
@@ -193,7 +203,19 @@ CASES = {
         lambda x, steps=20: (1.01 if steps < 10 else 1.0) * slope(x, steps),
         {"horizons": (1, 5, 20)},
     ),
-    "noise above the last digits": (1, "nondeterministic", noisy, scaled(2.0), {}),
+    "noise above the last digits": (1, "wrong_factor", noisy, scaled(2.0), {}),
+    "noise of the cost": (3, "noisy", noisy, slope, {}),
+    "expected noise of the cost": (0, "noisy", noisy, slope, {"expect": "noisy"}),
+    "noise of the gradient too": (3, "noisy", noisy, lambda x: slope(x) * RANDOM.normal(1.0, 1e-3), {}),
+    "noise of the gradient alone": (1, "nondeterministic", swing, lambda x: slope(x) * RANDOM.normal(1.0, 0.1), {}),
+    "a root to a thousandth": (3, "adaptive", root, root_slope, {"theta": [1.3, 0.9]}),
+    "a third too much of a root to a millionth": (
+        1,
+        "",
+        partial(root, xtol=1e-6),
+        lambda x: 1.3 * root_slope(x),
+        {"theta": [1.3, 0.9]},
+    ),
     "a warm start": (
         1,
         "nondeterministic",
