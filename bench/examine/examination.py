@@ -277,7 +277,6 @@ class _Examination:
                 clock.counts["gradients"],
                 clock.spent,
                 clock.compile_s,
-                clock.elapsed,
                 clock.seconds_per("costs"),
                 clock.seconds_per("gradients"),
                 clock.budget,
@@ -297,7 +296,6 @@ class _Examination:
             is_failed=stages.is_failed,
             n_failed=simulator.raised["gradients"].total(),
             printed=simulator.printed.getvalue().splitlines(),
-            changing=sorted(simulator.changing),
             notes=[
                 *simulator.notes,
                 *(f"the cost raised {n} times: {text}" for text, n in simulator.raised["costs"].most_common(3)),

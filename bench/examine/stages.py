@@ -69,12 +69,7 @@ class Repeats:
     @property
     def is_large(self) -> bool:
         """Whether these differences are a fault, and no limit of the check's accuracy."""
-        return self.spread > self.floor or self.is_large_of_gradient
-
-    @property
-    def is_large_of_gradient(self) -> bool:
-        """Whether equal calls of the gradient differ by as much."""
-        return self.of_gradient > self.floor_of_gradient
+        return self.spread > self.floor or self.of_gradient > self.floor_of_gradient
 
 
 class GradientStages:

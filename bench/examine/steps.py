@@ -7,7 +7,6 @@ loops all have fixed lengths has no such excuse.
 from __future__ import annotations
 
 import ast
-import inspect
 import itertools
 import linecache
 import sys
@@ -56,13 +55,14 @@ def rounds_of_loops(simulator: Simulator, theta: np.ndarray, w: np.ndarray | Non
         file, caller = frame.f_code.co_filename, frame.f_back
         while running and running[-1][0] is not caller:
             running.pop()
-        if caller is not None and not frame.f_code.co_flags & inspect.CO_GENERATOR:
-            # one call of compiled code enters Python functions again and again
-            site = caller, caller.f_lasti
-            rounds[caller.f_code.co_filename, caller.f_lineno] += site in running[-1:] and _is_outside(caller)
+        if caller is not None:
+            # one call of compiled code, in no loop of its file, enters Python functions again and again
+            site, line, outer = (caller, caller.f_lasti), caller.f_lineno, caller.f_code.co_filename
+            if site in running[-1:] and not any(loop.lineno <= line <= loop.end_lineno for loop in _loops(outer)):
+                rounds[outer, line] += 1
             running[-1:] = [site]
         running.append((frame, -1))
-        lines = set() if _is_skipped(file) else _while_loops(file)
+        lines = _while_loops(file)
 
         def follow(frame: FrameType, event: str, argument: Any) -> Any:
             if event == "line" and frame.f_lineno in lines:
@@ -75,18 +75,11 @@ def rounds_of_loops(simulator: Simulator, theta: np.ndarray, w: np.ndarray | Non
     return rounds if np.isfinite(costs).all() else Counter()
 
 
-def _is_skipped(file: str) -> bool:
-    return any(folder in file for folder in SKIPPED)
-
-
-def _is_outside(frame: FrameType) -> bool:
-    """Return whether the line that a frame runs is in no loop of its file."""
-    file, line = frame.f_code.co_filename, frame.f_lineno
-    return not _is_skipped(file) and all(not loop.lineno <= line <= loop.end_lineno for loop in _loops(file))
-
-
 @cache
 def _loops(file: str) -> list[Any]:
+    """Return the loops of a file of the program."""
+    if any(folder in file for folder in SKIPPED):
+        return []
     try:
         nodes = ast.walk(ast.parse("".join(linecache.getlines(file))))
     except SyntaxError:

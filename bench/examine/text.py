@@ -124,7 +124,6 @@ def warnings(report: Findings) -> list[str]:
         and not report.is_failed,
         f"the cost is not a number or raises an exception, {report.place}": report.derivative_cause != "nonfinite"
         and report.place,
-        **{f"{name} changes theta in place: each call gets a copy": True for name in report.changing},
         f"cost and gradient printed {counted(len(report.printed), 'line')}; the first: {shortened(''.join(report.printed[:1]))}": report.printed,
         report.missed_text: not report.status
         and report.missed > SEEN
@@ -253,7 +252,6 @@ def _head(report: Findings) -> list[str]:
     times = {
         "within the budget": spent.seconds,
         "first calls": spent.compile_s,
-        "all": spent.elapsed,
         "a cost": spent.cost_s,
         "a gradient": spent.gradient_s,
     }

@@ -13,7 +13,7 @@ import numpy as np
 from . import roughness
 from .causes import Ratio, causes_of_ratios
 from .direction import EPS, FINE, GUARD, Finding, Sample, judge
-from .rules import FAULTS, RULES, TRUSTED, UNEQUAL, VERDICTS, most_severe
+from .rules import FAULTS, RULES, TRUSTED, UNEQUAL, VERDICTS
 from .sampling import Modes, order, repeats, sampled
 
 Cost = Callable[[np.ndarray], np.ndarray]
@@ -177,7 +177,8 @@ def cause_of(parts: Sequence[Part], draws: Sequence[Part] = (), others: Sequence
     Among the derivatives that are other numbers than the differences, it is the verdict of most components, and of most
     directions where all components are right; of two that are as frequent, the worse.
     """
-    worst = most_severe([p.verdict for p in parts] + [p.verdict for p in draws if p.verdict in FAULTS] + [*others])
+    found = [p.verdict for p in parts] + [p.verdict for p in draws if p.verdict in FAULTS] + [*others]
+    worst = min(found, key=VERDICTS.index)
     if worst not in UNEQUAL:
         return worst
     wrong = [part for part in (*parts, *draws) if part.verdict in UNEQUAL]

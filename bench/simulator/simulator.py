@@ -16,7 +16,7 @@ import numpy as np
 
 from bench.errors import UserError, failure, unknown
 from bench.simulator.clock import KINDS, Clock, OutOfTime
-from bench.simulator.tree import ParameterTree, as_numpy, numbers
+from bench.simulator.tree import ParameterTree, as_numpy
 
 BATCHES = ("loop", "vmap", "columns", "rows")
 """Batching modes of a cost: one theta per call, the library's vmap, arrays ``(d, B)``, arrays ``(B, d)``."""
@@ -36,8 +36,6 @@ KEPT = 4
 """Most failed calls that are kept, to be made again."""
 PACKAGE = str(Path(__file__).parents[1])
 """Folder of this package."""
-COMPARED = 10_000_000
-"""Numbers of theta in all calls up to which each call is searched for changes of theta."""
 
 
 def _reason(error: Exception) -> str:
@@ -93,8 +91,6 @@ class Simulator:
         """What cost and gradient print."""
         self.first_value = float("nan")
         """The cost at theta, from the first call, with w = 0."""
-        self.changing: set[str] = set()
-        """Which of the user's functions change theta in place: ``the cost``, ``the gradient``."""
         self._cost = self._guarded(cost, "the cost")
         self._grad = self._guarded(grad, "the gradient") if callable(grad) else grad
         self._shapes: set[Any] = set()
@@ -107,16 +103,12 @@ class Simulator:
         self.batch = self._detect_batch(batch)
 
     def _guarded(self, function: Callable[..., Any], name: str) -> Callable[..., Any]:
-        """Wrap a user's function: printing is collected, changes of theta are noted, ``sys.exit`` raises RuntimeError.
+        """Wrap a user's function: printing is collected, ``sys.exit`` raises RuntimeError.
 
         A test must not pass because a simulator exits with status 0.
         """
 
         def call(theta: Any, *arguments: Any, **settings: Any) -> Any:
-            # arrays of JAX never change, and inside of vmap they have no numbers
-            is_compared = name not in self.changing and self.library != "jax" and self.batch != "vmap"
-            is_compared = is_compared and self.clock.used * self.layout.vector.size < COMPARED
-            before = numbers(theta).copy() if is_compared else None
             try:
                 with redirect_stdout(self.printed), redirect_stderr(self.printed):
                     value = function(theta, *arguments, **settings)
@@ -126,9 +118,6 @@ class Simulator:
             except SystemExit as error:
                 code = "" if error.code is None else error.code
                 raise RuntimeError(f"it ended the process by sys.exit({code})") from None
-            finally:
-                if before is not None and not np.array_equal(before, numbers(theta)):
-                    self.changing.add(name)
 
         return call
 
