@@ -21,15 +21,12 @@ from bench.gradient.smooth_part import COSTS, SmoothPart, smooth_part
 
 NEAR = 0.05
 """Largest relative error of a gradient that small jumps may explain."""
-EXPLAINED, EXPLAINED_IF_SHARED = 25.0, 100.0
+EXPLAINED, EXPLAINED_IF_SMALL = 25.0, 100.0
 """Largest error of a slope that adaptive steps explain, in multiples of the slopes of the breaks on a line: the heights of its
 jumps over its length, and its kinks' changes of slope. Of right gradients it reaches 22, since only six breaks of a line are known,
-and more where a solver's error is smooth: then it is small, and all slopes have a share of it."""
+and more where a solver's error is smooth: then it is small."""
 FEWEST_BREAKS = 3
 """Fewest breaks on all lines that bound such a small error."""
-LARGE, SHARED = 0.1, 0.01
-"""Least slope of a component, relative to the largest, that has a share of such an error, and its least share. A wrong input
-spoils only its own slope."""
 MOST_OF_CHANGE = 0.5
 """Largest height of all jumps, as a share of the cost's change along a line, that adaptive steps make."""
 SPREADS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8, 0.8)
@@ -44,7 +41,7 @@ DIFFERENCED, SAME = 4, 1e-3
 """Most components at which differences are compared with a wrong gradient, and the largest part of its error that is left."""
 DIFFERENCE_STEPS = 10.0 ** -np.arange(1.0, 9.0)
 """Steps of these differences, in units of max(1, |x|)."""
-BESIDE, MOST_ROWS = 1e-3, 64
+BESIDE, MOST_ROWS = 1e-5, 64
 """Spacing of the thetas at which the noise of a gradient is measured, in units of each input's scale, and most numbers of it."""
 LOOSE, MOST_OF_IT, REFINED = 0.01, 0.6, 10.0
 """Relative error of a difference that shows too little, largest share of the remaining calls for a component's smooth part,
@@ -230,14 +227,9 @@ def relative_error(outcome: Check) -> float:
 
     A discretisation changes all components by an amount of one size, which is large beside a small component.
     """
-    errors, slopes = _in_scales(outcome.parts)
+    rows = [np.array([p.program - p.difference, p.difference]) * p.sample.scale for p in outcome.parts]
+    errors, slopes = np.array([row for row in rows if np.isfinite(row).all()]).reshape(-1, 2).T
     return float(np.linalg.norm(errors) / np.linalg.norm(slopes))
-
-
-def _in_scales(parts: Iterable[Part]) -> np.ndarray:
-    """Return sizes of errors and of differences in units of the scales, ``(2, n)``; a group or a direction has length 1 in these."""
-    rows = [np.abs([p.program - p.difference, p.difference]) * p.sample.scale for p in parts]
-    return np.array([row for row in rows if np.isfinite(row).all()]).reshape(-1, 2).T
 
 
 def may_be_adaptive(outcome: Check) -> bool:
@@ -266,10 +258,8 @@ def is_adaptive(
     line = scan(partial(stages.costs_along, direction), direction, noise, LONG, effort, stages.simulator.unit)
     lines = [*lines, line]
     slope = max(_slope_of_breaks(one, stages.scale) for one in lines)
-    errors, slopes = _in_scales(outcome.components)
-    is_shared = (errors >= SHARED * size)[slopes >= LARGE * slopes.max(initial=0.0)].all()
-    is_bounded = size > EXPLAINED_IF_SHARED * slope and sum(len(one.breaks) for one in lines) >= FEWEST_BREAKS
-    return size <= EXPLAINED * slope or bool(is_shared and relative_error(outcome) <= NEAR and not is_bounded)
+    is_bounded = size > EXPLAINED_IF_SMALL * slope and sum(len(one.breaks) for one in lines) >= FEWEST_BREAKS
+    return size <= EXPLAINED * slope or (relative_error(outcome) <= NEAR and not is_bounded)
 
 
 def _error_vector(stages: GradientStages, outcome: Check) -> np.ndarray:

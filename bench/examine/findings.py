@@ -22,7 +22,7 @@ from bench.gradient import FAULTS, TRUSTED, Check, Part, Sample, rules
 from bench.gradient.direction import CHANCE, MIN_STEPS, resolution
 from bench.gradient.roughness import FINE
 from bench.gradient.rules import EXCUSABLE, RULES, STATUS, SUSPICIOUS, UNEQUAL
-from bench.gradient.smooth_part import LIMIT
+from bench.gradient.smooth_part import CLEAR, LIMIT
 from bench.report.text import counted, number, span
 from bench.simulator.tree import ParameterTree
 
@@ -159,8 +159,6 @@ class Spent:
     """Time within the budget [s]."""
     compile_s: float
     """Time of first calls [s]."""
-    elapsed: float
-    """Time on the clock, including first calls and waiting for a processor that other programs use [s]."""
     cost_s: float
     """Time of one cost [s]."""
     gradient_s: float
@@ -211,8 +209,6 @@ class Findings:
     """Number of gradient calls that raised an exception."""
     printed: Sequence[str]
     """The lines that cost and gradient printed."""
-    changing: Sequence[str]
-    """Which of the functions change theta in place."""
     notes: Sequence[str]
     left_out: Sequence[str]
     """The parts of the examination that the budget did not allow."""
@@ -270,9 +266,11 @@ class Findings:
 
     @property
     def _is_averaged(self) -> bool:
-        """Whether wide steps meet several sequences of steps: the slope over them is another than at tiny steps."""
-        known = [(part, self.explained.smooth_parts.get(part.name)) for part in self.check.parts]
-        return any(wide and abs(wide.slope - part.difference) > wide.error + part.uncertainty for part, wide in known)
+        """Whether wide steps meet several sequences of steps, along each wrong part: the slope over them is another than at tiny steps."""
+        smooth, wrong = self.explained.smooth_parts, {p.name for p in self.settled.parts if p.verdict in UNEQUAL}
+        known = [(part, wide) for part in self.check.parts if (wide := smooth.get(part.name))]
+        is_other = any(abs(wide.slope - part.difference) > wide.error + part.uncertainty for part, wide in known)
+        return is_other and wrong <= {part.name for part, _ in known}
 
     @cached_property
     def _refined(self) -> dict[str, float]:
@@ -303,9 +301,10 @@ class Findings:
         tolerance, apart = max(float(rtol), resolution(self.unit)), abs(part.program - slope)
         allowed = tolerance * size + float(atol)
         is_rough = any(each.error > tolerance * abs(each.slope) for each in explained.wide)
+        doubt = CLEAR * error
         if refined is None and is_rough and error <= allowed:
             error = LOOSE * size  # of one sequence of steps, whose changes other parts show
-        if error > LIMIT * size:
+        if error > LIMIT * size or error < apart - allowed <= doubt:
             verdict = "unsettled"
         elif apart > error + allowed:
             if not is_open and abs(part.program - part.difference) <= 2.0 * part.uncertainty:
@@ -425,7 +424,11 @@ class Findings:
         yield "nondeterministic", repeats.is_failing, "equal calls raise an exception or return a number"
         yield "raised", self.is_failed, shortened(self.error)
         yield "undecided", not self.check.parts, self.n_checked
-        yield "nondeterministic", repeats.is_large, self.spread_text
+        is_noisy = repeats.spread > repeats.floor and not repeats.has_state
+        yield "nondeterministic", repeats.is_large and not is_noisy, self.spread_text
+        known = f"{self.spread_text}; {counted(len(self.resolved_parts), 'slope')} known to 10%"
+        is_noisy &= repeats.of_gradient > repeats.floor_of_gradient or self.settled.cause not in UNEQUAL
+        yield "noisy", is_noisy, known
         if self.wrong_checks:
             yield from self._verdicts_on_failed(self.wrong_checks[0].cause)
         yield from self._verdicts_on_passed()

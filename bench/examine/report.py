@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
-from bench.errors import UserError, local_path, needing_sweeps, unknown
+from bench.errors import local_path, needing_sweeps
 from bench.examine import UPDATE, baseline, text
 from bench.examine.findings import Findings
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, repr=False)
@@ -32,27 +28,6 @@ class Report(Findings):
 
     def __repr__(self) -> str:
         return str(self)
-
-    def _repr_html_(self) -> str:
-        return f"<p><b>{escape(self.name)}: {escape(self.conclusion)}</b></p><pre>{escape(str(self))}</pre>"
-
-    def plot(self, chart: str = "") -> Figure:
-        """Return a chart of the page: ``steps`` or ``lines``, by default the first for which there is data.
-
-        Raises :class:`bench.UserError` for a chart without data.
-        """
-        with needing_sweeps("plot"):
-            from bench.examine import files
-            from bench.report.draw import draw
-            from bench.report.figures import displayable, styled
-
-        figures = {one.name: one for one in files.charts(self)}
-        if not figures:
-            raise UserError("this examination has no data for a chart: give a gradient, sigma or a larger budget")
-        if chart and chart not in figures:
-            raise unknown("chart", chart, figures)
-        with styled():
-            return displayable(draw(figures[chart or next(iter(figures))]))
 
     def assert_right(self) -> None:
         """Raise AssertionError with the full report unless the status is 0."""

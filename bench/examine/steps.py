@@ -24,13 +24,14 @@ SKIPPED = tuple(
     f"/{name}/" for name in ("jax", "jaxlib", "torch", "numpy", "bench/model", "bench/gradient", "bench/examine")
 )
 """Folders whose loops are those of a library, not of the program."""
+LOOPS = (ast.For, ast.While, ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 
 
 def changing_loop(simulator: Simulator, thetas: np.ndarray, w: np.ndarray | None) -> str:
-    """Return a while loop whose length depends on theta, as ``the loop at ode.py:17``; empty where none is known.
+    """Return a loop whose length depends on theta, as ``the loop at ode.py:17``; empty where none is known.
 
     A JAX program is read: a loop that does not count to a number. Other Python code runs under a trace at
-    ``thetas (d, n)``. Loops of compiled code are not seen.
+    ``thetas (d, n)``. Loops of compiled code are seen where they call a Python function.
     """
     place = _loop_of_jax(simulator, thetas[:, 0], w)
     if place or simulator.library == "jax":
@@ -43,15 +44,25 @@ def changing_loop(simulator: Simulator, thetas: np.ndarray, w: np.ndarray | None
 
 
 def rounds_of_loops(simulator: Simulator, theta: np.ndarray, w: np.ndarray | None) -> Counter[tuple[str, int]]:
-    """Return by file and line of a while loop how often its condition is computed by one call of the cost at ``theta (d,)``.
+    """Return by file and line how often a while loop, or a function that compiled code calls, runs in a cost at ``theta (d,)``.
 
     Empty where the cost is not a number, since its loops may have been cut off.
     """
     rounds: Counter[tuple[str, int]] = Counter()
+    running: list[tuple[FrameType | None, int]] = []  # frames, each with its last instruction that entered another
 
     def enter(frame: FrameType, event: str, argument: Any) -> Any:
-        file = frame.f_code.co_filename
-        lines = set() if any(folder in file for folder in SKIPPED) else _while_loops(file)
+        file, caller = frame.f_code.co_filename, frame.f_back
+        while running and running[-1][0] is not caller:
+            running.pop()
+        if caller is not None:
+            # one call of compiled code, in no loop of its file, enters Python functions again and again
+            site, line, outer = (caller, caller.f_lasti), caller.f_lineno, caller.f_code.co_filename
+            if site in running[-1:] and not any(loop.lineno <= line <= loop.end_lineno for loop in _loops(outer)):
+                rounds[outer, line] += 1
+            running[-1:] = [site]
+        running.append((frame, -1))
+        lines = _while_loops(file)
 
         def follow(frame: FrameType, event: str, argument: Any) -> Any:
             if event == "line" and frame.f_lineno in lines:
@@ -65,16 +76,24 @@ def rounds_of_loops(simulator: Simulator, theta: np.ndarray, w: np.ndarray | Non
 
 
 @cache
+def _loops(file: str) -> list[Any]:
+    """Return the loops of a file of the program."""
+    if any(folder in file for folder in SKIPPED):
+        return []
+    try:
+        nodes = ast.walk(ast.parse("".join(linecache.getlines(file))))
+    except SyntaxError:
+        return []
+    return [node for node in nodes if isinstance(node, LOOPS)]
+
+
+@cache
 def _while_loops(file: str) -> set[int]:
     """Return the line at which each round of each while loop of a file begins.
 
     A for loop runs over a list, whose length is often the number of contacts rather than of steps.
     """
-    try:
-        nodes = ast.walk(ast.parse("".join(linecache.getlines(file))))
-    except SyntaxError:
-        return set()
-    loops = [node for node in nodes if isinstance(node, ast.While)]
+    loops = [node for node in _loops(file) if isinstance(node, ast.While)]
     # the condition of `while True` is not computed
     return {(loop.body[0] if isinstance(loop.test, ast.Constant) else loop).lineno for loop in loops}
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from bench.examine.findings import FAILED, NONE, RIGHT, SEEN, Findings, as_text, shortened
 from bench.examine.lines import REACH
-from bench.examine.smoothing import PAIRS
+from bench.examine.smoothing import PAIRS, TARGET_ERROR
 from bench.gradient import FAULTS
 from bench.gradient.rules import RULES
 from bench.report.text import counted, duration, number
@@ -69,7 +69,8 @@ def noise_answer(report: Findings) -> str:
     elif report.use == "usable":
         bounds = [(one.bias_percent[1], 100 * one.unseen / one.norm) for one in known]
         bias, unseen = np.max(bounds, axis=0, initial=0.0).tolist()
-        fact = f". The bias of the mean gradient is below {number(bias)}%"
+        fact = f" to {100 * TARGET_ERROR:.0f}%" * (report.derivative_cause == "biased")
+        fact += f". The bias of the mean gradient is below {number(bias)}%"
         fact += f", and an event that no draw met may add {number(unseen)}%"
     where = (
         f"Under noise of sigma {', '.join(map(setup.shown, levels))}"
@@ -116,14 +117,13 @@ def warnings(report: Findings) -> list[str]:
         f"zero: {', '.join(zeros[:MANY])}{' ...' * (len(zeros) > MANY)}": zeros
         and report.derivative_cause != "constant",
         **{
-            f"{limit}: errors below about {100 * report.resolution:.1g}% are not seen": holds
+            f"{limit}: errors below about {number(100 * report.resolution, 1)}% are not seen": holds
             for limit, holds in limits.items()
         },
         f"the gradient raised an exception {report.n_failed} times away from theta: {shortened(report.error)}": report.n_failed
         and not report.is_failed,
         f"the cost is not a number or raises an exception, {report.place}": report.derivative_cause != "nonfinite"
         and report.place,
-        **{f"{name} changes theta in place: each call gets a copy": True for name in report.changing},
         f"cost and gradient printed {counted(len(report.printed), 'line')}; the first: {shortened(''.join(report.printed[:1]))}": report.printed,
         report.missed_text: not report.status
         and report.missed > SEEN
@@ -252,7 +252,6 @@ def _head(report: Findings) -> list[str]:
     times = {
         "within the budget": spent.seconds,
         "first calls": spent.compile_s,
-        "all": spent.elapsed,
         "a cost": spent.cost_s,
         "a gradient": spent.gradient_s,
     }

@@ -2,7 +2,7 @@
 
 from .check import Check, Options, Part, check, settle
 from .direction import EPS, Sample, best, judge, step_sizes
-from .rules import BROKEN, FAULTS, RULES, TRUSTED, UNDECIDED, VERDICTS, most_severe
+from .rules import BROKEN, FAULTS, RULES, TRUSTED, UNDECIDED, VERDICTS
 from .sampling import sampled
 
 __all__ = [
@@ -20,7 +20,6 @@ __all__ = [
     "best",
     "check",
     "judge",
-    "most_severe",
     "sampled",
     "settle",
     "step_sizes",

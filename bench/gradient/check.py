@@ -13,7 +13,7 @@ import numpy as np
 from . import roughness
 from .causes import Ratio, causes_of_ratios
 from .direction import EPS, FINE, GUARD, Finding, Sample, judge
-from .rules import FAULTS, RULES, TRUSTED, UNEQUAL, VERDICTS, most_severe
+from .rules import FAULTS, RULES, TRUSTED, UNEQUAL, VERDICTS
 from .sampling import Modes, order, repeats, sampled
 
 Cost = Callable[[np.ndarray], np.ndarray]
@@ -56,6 +56,8 @@ class Options:
     """Steps in falling order, relative to each input's own scale."""
     unit: float = float(np.finfo(np.float64).eps)
     """Declared unit roundoff of the arithmetic; the noise of the cost is measured in addition."""
+    step: float = 0.0
+    """Step of the differences that are the gradient, in units of theta: where slopes change, they err by as much as over it."""
     scale: np.ndarray | None = None
     """The scale of each input ``(d,)``; None uses :func:`scales`."""
     scanned: int = 4
@@ -175,7 +177,8 @@ def cause_of(parts: Sequence[Part], draws: Sequence[Part] = (), others: Sequence
     Among the derivatives that are other numbers than the differences, it is the verdict of most components, and of most
     directions where all components are right; of two that are as frequent, the worse.
     """
-    worst = most_severe([p.verdict for p in parts] + [p.verdict for p in draws if p.verdict in FAULTS] + [*others])
+    found = [p.verdict for p in parts] + [p.verdict for p in draws if p.verdict in FAULTS] + [*others]
+    worst = min(found, key=VERDICTS.index)
     if worst not in UNEQUAL:
         return worst
     wrong = [part for part in (*parts, *draws) if part.verdict in UNEQUAL]
@@ -352,8 +355,9 @@ class _Checker:
             program = np.where(vectors != 0.0, vectors * gradients, 0.0).sum(axis=0) / lengths
         whole = np.abs(np.nan_to_num(gradients, posinf=0.0, neginf=0.0)) * self.scale[:, None]
         largest = whole.max(axis=0)
-        # a component this much smaller than the others may be only their rounding, unless it is exactly 0
-        doubts = np.where(program != 0.0, np.sqrt(self.unit) * largest / lengths, 0.0)
+        # a component this much smaller than the others may be only their error, unless it is exactly 0
+        doubt = np.maximum(np.sqrt(self.unit), self.options.step / lengths)
+        doubts = np.where(program != 0.0, doubt * largest / lengths, 0.0)
         samples, minus, plus = sampled(
             self.cost,
             thetas,
@@ -487,21 +491,15 @@ class _Checker:
     def _is_right_far_away(self) -> bool:
         """Return whether the gradient is right at some theta farther away, so that a missing term acts only near theta.
 
-        The gradient must be right along two random directions, since one may agree by chance. A slope of exactly 0 does
-        not count.
+        A slope of exactly 0 does not count.
         """
         count = self.options.draws
         away = np.repeat(FAR, count) * self.scale[:, None]
         thetas = (self.theta[:, None] + away * self.random.standard_normal((self.theta.size, len(FAR) * count))).T
-        right = [(theta, self.gradient(theta)) for theta in thetas]
-        for _ in range(2):
-            vectors = self.scale[:, None] * self.random.standard_normal((self.theta.size, len(right)))
-            lines = [_Line("", *each, vector) for each, vector in zip(right, vectors.T, strict=True)]
-            parts = self._check_lines(lines)
-            right = [
-                each for each, part in zip(right, parts, strict=True) if part.verdict in PLAINLY and part.program != 0.0
-            ]
-        return bool(right)
+        lines = [
+            _Line("", each, self.gradient(each), self.scale * self.random.standard_normal(each.size)) for each in thetas
+        ]
+        return any(part.verdict in PLAINLY for part in self._check_lines(lines))
 
 
 def _real(name: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

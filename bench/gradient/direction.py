@@ -26,7 +26,7 @@ GUARD = 64.0
 MEASURED = 8.0
 """Allowed error of a cost whose noise is measured, in standard deviations of the noise and in unit roundoffs."""
 NOISY = 80.0
-"""Error of a difference, in multiples of its rounding in float64, above which the cost has noise of its own."""
+"""Error of a difference, in multiples of its rounding, above which the cost has noise of its own."""
 RISE = 0.01
 """Relative error above which the difference at a large step counts as inaccurate."""
 DECADES = 3.0
@@ -153,7 +153,7 @@ def judge(sample: Sample) -> Finding:
     - ``unsettled``: the differences agree at no step, or differences at smaller steps contradict them.
     - ``wrong_adjoint``: the differences agree on a value other than the derivative.
     - Verdicts on a right derivative: ``saturated`` if derivative and differences are exactly 0 at the smallest steps
-      only. ``rounding`` if differences at small steps have more than ten times the error that float64 explains.
+      only. ``rounding`` if differences at small steps have more error than the arithmetic explains.
       ``mode_crossing`` if differences at large steps are inaccurate and the contact mode changes, ``nonlinear`` if it
       does not. Otherwise ``smooth``.
     """
@@ -369,7 +369,7 @@ def _classify_right(sample: Sample, index: int, still: np.ndarray) -> str:
         return "saturated"
     errors = np.abs(sample.differences - sample.derivative)
     small = np.arange(errors.size) > index
-    if (errors > NOISY * sample.rounding(float(np.finfo(np.float64).eps)))[small].sum() >= 3:
+    if (errors > NOISY * sample.rounding(sample.unit))[small].sum() >= 3:
         return "rounding"
     risen = (errors > RISE * sample.size(index)) & ~small & (errors > sample.uncertainty)
     if (risen & sample.crossing).any():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
 STATUS = {"right": 0, "fault": 1, "broken": 1, "open": 3}
@@ -104,7 +103,7 @@ DERIVATIVE = {
     ),
     "nonfinite": Rule(
         "open",
-        "a cost is NaN or infinite",
+        "a cost is not a number, or raises an exception",
         "at theta, or a number at fewer than {direction.MIN_STEPS} step sizes, or under noise; in `examine` also within u^(1/3) of theta",
     ),
     "unsettled": Rule(
@@ -232,6 +231,13 @@ EXAMINATION = {
         "check that it reaches the simulator",
         ("allow_zero=NAME",),
     ),
+    "noisy": Rule(
+        "open",
+        "the cost draws noise of its own, which hides the slope",
+        "the spread of equal calls of the cost is above u^{stages.SMALL} of it and does not come from the call before, and nothing else is wrong",
+        "fix the seed, or pass the noise as w and set noise=N",
+        EXPECTED,
+    ),
     "constant": Rule(
         "open",
         "no input moves the cost, and its gradient is 0, or below rounding",
@@ -257,8 +263,8 @@ EXAMINATION = {
         "gradient and differences differ by as much as the discretisation does, as with adaptive steps: neither is "
         "exactly the derivative of the solution",
         "`missing_term` or `wrong_adjoint` where a loop's length depends on theta, and the error is at most {diagnosis.EXPLAINED:g} times "
-        "the jumps and kinks of a line, as slopes over its length; or {diagnosis.EXPLAINED_IF_SHARED:g} times, or there are fewer than "
-        "{diagnosis.FEWEST_BREAKS}, where it is at most {diagnosis.NEAR:.0%} and every large slope has a share. With `refined`: the gradient is at "
+        "the jumps and kinks of a line, as slopes over its length; or {diagnosis.EXPLAINED_IF_SMALL:g} times, or there are fewer than "
+        "{diagnosis.FEWEST_BREAKS}, where it is at most {diagnosis.NEAR:.0%}. With `refined`: the gradient is at "
         "most {findings.AGREES:g} times as far from it as the differences at each theta, or {findings.AS_FAR:g} times beside such a loop. "
         "Of a rough cost: no slope over wide steps is known to {smooth_part.LIMIT:.0%}",
         "give the cost at a tighter tolerance; accept it if the gradient is meant to be that one's",
@@ -321,8 +327,3 @@ SUSPICIOUS = tuple(name for name in UNEQUAL if name != "disconnected")
 """Causes that adaptive steps and kinks imitate."""
 EXCUSABLE = tuple(name for name in SUSPICIOUS if "refined=COST" in RULES[name].settings)
 """Causes that a discretisation imitates: it makes no constant factor."""
-
-
-def most_severe(verdicts: Iterable[str]) -> str:
-    """Return the worst of the verdicts."""
-    return min(verdicts, key=VERDICTS.index)

@@ -31,6 +31,8 @@ SPREAD = 3.0
 """Standard errors that count as the error of a slope."""
 LIMIT = 0.1
 """Largest relative error of a slope that decides."""
+CLEAR = 2.0
+"""Least distance of a wrong derivative from a slope, in multiples of its error, which scatter does not bound."""
 COSTS = POINTS * SCALES.size
 """Costs for one component."""
 

@@ -132,6 +132,8 @@ class Problem(ABC):
     """Capabilities of the backend that compiled the program."""
     backend: str = ""
     """Identity string of that backend, where it was given as one."""
+    step = 0.0
+    """Step of the differences of the cost that are the gradient, in units of theta; 0 for another gradient."""
 
     def __init__(self, program: Program) -> None:
         self.program = program
@@ -206,10 +208,10 @@ class Problem(ABC):
         :attr:`Program.score_refusal`.
         """
         theta, w, is_single = self._arguments(theta, w)
-        if not self.noise_on_theta and self.program.score_refusal:
+        is_known = self.noise_on_theta
+        if not is_known and self.program.score_refusal:
             raise Unsupported(self.program.score_refusal)
-        of_theta = self.noise_on_theta
-        scores = w[: self.dim] / self.sigma if of_theta else self._blocks(self._score, theta, w, (self.dim,))
+        scores = w[: self.dim] / self.sigma if is_known else self._blocks(self._score, theta, w, (self.dim,))
         return scores[:, 0] if is_single else scores
 
     def _arguments(self, theta: ArrayLike | None, w: ArrayLike | None) -> tuple[np.ndarray, np.ndarray, bool]:

@@ -6,7 +6,6 @@ import io
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -100,16 +99,4 @@ def _with_palette(png: io.BytesIO) -> bytes:
     image.putpalette([255 if value >= 253 else value for value in image.getpalette() or ()])  # white stays white
     buffer = io.BytesIO()
     image.save(buffer, "png", optimize=True)
-    return buffer.getvalue()
-
-
-def displayable(figure: Figure) -> Figure:
-    """Make a notebook show a figure that was made without pyplot; return the figure."""
-    setattr(figure, "_repr_png_", partial(_png, figure))  # noqa: B010, Figure declares no such attribute
-    return figure
-
-
-def _png(figure: Figure) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
     return buffer.getvalue()

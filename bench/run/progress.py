@@ -148,7 +148,9 @@ def print_plan(experiment: Experiment, planned: Sequence[Planned], rows: pd.Data
     n_stored = sum(item.stored for item in planned)
     refusals = [item.refusal for item in planned if item.refusal is not None]
     runs = [item for item in planned if item.runs]
-    print(f"{experiment.name}: {len(planned)} cells, {n_stored} stored, {len(runs)} to run, {len(refusals)} refused")
+    print(
+        f"{experiment.name}: {len(planned)} cell{'s' * (len(planned) != 1)}, {n_stored} stored, {len(runs)} to run, {len(refusals)} refused"
+    )
     print_others(experiment, planned, rows["key"])
     print_stale(planned)
     for reason, count in Counter(f"{status}: {reason}" for status, reason in refusals).most_common():

@@ -89,14 +89,9 @@ class Clock:
         """Remaining seconds of the budget."""
         return self.budget - self.spent
 
-    @property
-    def remaining_calls(self) -> float:
-        """Remaining calls, infinite without a limit."""
-        return self.calls - self.used
-
     def can_afford(self, costs: float, gradients: float = 0.0, share: float = 1.0) -> bool:
         """Return whether these numbers of costs and gradients fit a share (0 to 1) of the remaining budget."""
-        if costs + gradients > share * self.remaining_calls:
+        if costs + gradients > share * (self.calls - self.used):
             return False
         if math.isinf(self.budget):
             return True
@@ -108,7 +103,7 @@ class Clock:
     def limit(self, share: float) -> None:
         """Limit subsequent calls to ``share`` (0 to 1) of the remaining budget."""
         self._deadline = self.spent + share * max(self.remaining, 0.0)
-        self._last_call = self.used + share * max(self.remaining_calls, 0.0)
+        self._last_call = self.used + share * max(self.calls - self.used, 0.0)
 
     def check(self, calls: int = 0) -> None:
         """Raise :class:`OutOfTime` if the budget or the limit of :meth:`limit` is spent, or ``calls`` would exceed it."""

@@ -9,13 +9,14 @@ from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from functools import partial
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bench.errors import UserError, failure, unknown
 from bench.simulator.clock import KINDS, Clock, OutOfTime
-from bench.simulator.tree import ParameterTree, as_numpy, numbers
+from bench.simulator.tree import ParameterTree, as_numpy
 
 BATCHES = ("loop", "vmap", "columns", "rows")
 """Batching modes of a cost: one theta per call, the library's vmap, arrays ``(d, B)``, arrays ``(B, d)``."""
@@ -33,8 +34,16 @@ SIMPLE_BITS = 12
 """Costs with at most this many significant bits, such as 0.5, show nothing about the precision."""
 KEPT = 4
 """Most failed calls that are kept, to be made again."""
-COMPARED = 10_000_000
-"""Numbers of theta in all calls up to which each call is searched for changes of theta."""
+PACKAGE = str(Path(__file__).parents[1])
+"""Folder of this package."""
+
+
+def _reason(error: Exception) -> str:
+    """Return the message of an exception and where it was raised, without the frames of this package that call the user's code."""
+    at = error.__traceback__
+    while at and at.tb_next and at.tb_frame.f_code.co_filename.startswith(PACKAGE):
+        at = at.tb_next
+    return str(error) if isinstance(error, UserError) else failure(error.with_traceback(at))["reason"]
 
 
 class Simulator:
@@ -82,8 +91,6 @@ class Simulator:
         """What cost and gradient print."""
         self.first_value = float("nan")
         """The cost at theta, from the first call, with w = 0."""
-        self.changing: set[str] = set()
-        """Which of the user's functions change theta in place: ``the cost``, ``the gradient``."""
         self._cost = self._guarded(cost, "the cost")
         self._grad = self._guarded(grad, "the gradient") if callable(grad) else grad
         self._shapes: set[Any] = set()
@@ -96,25 +103,21 @@ class Simulator:
         self.batch = self._detect_batch(batch)
 
     def _guarded(self, function: Callable[..., Any], name: str) -> Callable[..., Any]:
-        """Wrap a user's function: printing is collected, changes of theta are noted, ``sys.exit`` raises RuntimeError.
+        """Wrap a user's function: printing is collected, ``sys.exit`` raises RuntimeError.
 
         A test must not pass because a simulator exits with status 0.
         """
 
         def call(theta: Any, *arguments: Any, **settings: Any) -> Any:
-            # arrays of JAX never change, and inside of vmap they have no numbers
-            is_compared = name not in self.changing and self.library != "jax" and self.batch != "vmap"
-            is_compared = is_compared and self.clock.used * self.layout.vector.size < COMPARED
-            before = numbers(theta).copy() if is_compared else None
             try:
                 with redirect_stdout(self.printed), redirect_stderr(self.printed):
-                    return function(theta, *arguments, **settings)
+                    value = function(theta, *arguments, **settings)
+                if value is None:
+                    raise UserError(f"{name} returned None, as without a return statement")
+                return value
             except SystemExit as error:
                 code = "" if error.code is None else error.code
                 raise RuntimeError(f"it ended the process by sys.exit({code})") from None
-            finally:
-                if before is not None and not np.array_equal(before, numbers(theta)):
-                    self.changing.add(name)
 
         return call
 
@@ -227,7 +230,7 @@ class Simulator:
                 raise
             if self.clock.is_interrupted:
                 raise OutOfTime from None
-            reason = failure(error)["reason"]
+            reason = _reason(error)
             if isinstance(self._grad, str) and not (is_cost or self.clock.counts[kind]):
                 advice = f"write it with {self._grad} alone, or give grad=FUNCTION"
                 raise UserError(f"{self._grad} cannot differentiate the cost: {advice} ({reason})") from None
@@ -275,7 +278,7 @@ class Simulator:
         try:
             value = self._call_once()
         except Exception as error:
-            problem = failure(error)["reason"]
+            problem = _reason(error)
             is_misread = isinstance(error, TypeError | AttributeError | LookupError)
             advice = (
                 "It must accept theta and return one number" if is_misread else "Give a theta at which it has a value"
@@ -325,8 +328,6 @@ class Simulator:
         """Record the precision of the cost's value; raises :class:`UserError` unless it is a real number."""
         if cost.dtype.kind == "c":
             raise UserError(f"the cost is complex ({cost.dtype}): it must be one real number")
-        if cost.dtype.kind == "O" and cost.size == 1 and cost.ravel()[0] is None:
-            raise UserError("the cost returned None: does it end with a return statement?")
         if cost.dtype.kind not in "fiub" and str(cost.dtype) != "bfloat16":
             raise UserError(f"the cost is of type {cost.dtype}: it must be one real number")
         if cost.dtype.kind == "f" or str(cost.dtype) == "bfloat16":

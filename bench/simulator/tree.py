@@ -195,7 +195,7 @@ class ParameterTree:
             return np.concatenate([part.ravel() for part in parts])
         numeric = leaves and all(part.dtype.kind in "biufc" for _, part in leaves)
         shapes = (
-            str(tuple(getattr(value, "shape", whole.shape)))
+            str(tuple(getattr(value, "shape", whole.shape or (1,) * hasattr(value, "__len__"))))
             if whole.size
             else ", ".join(f"{path} {part.shape}".strip() for path, part in leaves)
         )

@@ -58,7 +58,7 @@ class MujocoProblem(SteppedProblem):
 
     def __init__(self, program: Program, backend: Mujoco) -> None:
         super().__init__(program)
-        self._backend = backend
+        self._backend, self.step = backend, backend.step
         self._engine = Engine(mjcf.build(backend, program), self._rolled.scene.substeps)
 
     def moved(self, first: np.ndarray, controls: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ class MujocoProblem(SteppedProblem):
 
     def step_jacobians(self, states: np.ndarray, controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return finite-difference Jacobians of the steps (``mjd_transitionFD``)."""
-        return self._engine.jacobians(states, controls, self._backend.step, self._backend.differences == "central")
+        return self._engine.jacobians(states, controls, self.step, self._backend.differences == "central")
 
     def engine_contacts(self) -> mjcf.Contacts:
         """Return the contacts of the twin's model."""
@@ -75,7 +75,7 @@ class MujocoProblem(SteppedProblem):
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         if self._backend.gradient == "rollouts":
-            return central_differences(self._value, theta, w, self._backend.step, self.block)
+            return central_differences(self._value, theta, w, self.step, self.block)
         return super()._grad(theta, w)
 
 

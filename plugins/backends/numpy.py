@@ -24,8 +24,7 @@ class Numpy(Backend):
 
     def compile(self, program: Program) -> Problem:
         # about the cube root of the unit roundoff, which balances rounding and truncation errors
-        step = self.step or {"float64": 1e-6, "float32": 5e-3}[self.dtype]
-        return NumpyProblem(program, self.dtype, step)
+        return NumpyProblem(program, self.dtype, self.step or {"float64": 1e-6, "float32": 5e-3}[self.dtype])
 
 
 def _stack(arrays: Sequence[Array], axis: int = 0) -> Array:
@@ -43,7 +42,7 @@ class NumpyProblem(Problem):
 
     def __init__(self, program: Program, dtype: str, step: float) -> None:
         super().__init__(program)
-        self._ops, self._dtype, self._step = LoopOps(NAMESPACE), np.dtype(dtype), step
+        self._ops, self._dtype, self.step = LoopOps(NAMESPACE), np.dtype(dtype), step
         self._bound = program.bind([self._dtype.type(p) for p in program.parameters()])
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
@@ -59,7 +58,7 @@ class NumpyProblem(Problem):
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         # usage counts gradients here, not rollouts: the cost of a gradient in rollouts is measured separately
-        return central_differences(self._value, theta, w, self._step, self.block)
+        return central_differences(self._value, theta, w, self.step, self.block)
 
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         self.usage.rollouts += 2 * self.dim * w.shape[1]
@@ -69,4 +68,4 @@ class NumpyProblem(Problem):
             with np.errstate(all="ignore"):
                 return np.asarray(self._bound.log_probability(self._ops, fixed, moved, w), dtype=np.float64)
 
-        return central_differences(at, theta, w, self._step, self.block)
+        return central_differences(at, theta, w, self.step, self.block)

@@ -43,6 +43,38 @@ def test_a_cost_that_fails_near_theta_is_reported(edge, status, cause):
     assert any("nearest at theta[0] +" in text for text in said)
 
 
+@pytest.mark.parametrize(
+    ("ending", "said"), [("raise", "diverged (test_answers.py:"), ("return", "the cost returned None")]
+)
+def test_a_note_says_where_the_users_code_failed(ending, said):
+    def failing(x):
+        if x[0] > 1.0 + 1e-6:
+            if ending == "raise":
+                raise ValueError("diverged")
+            return None
+        return cost(x)
+
+    (note,) = (line for line in str(examine(failing, THETA, grad=gradient)).splitlines() if line.startswith("note"))
+    assert said in note
+    assert "<" not in note  # no function that calls the user's
+
+
+def test_a_bias_that_is_small_enough_is_no_contradiction():
+    def noisy(x, w):
+        return [2.12 * x[0] + 0.3 * w[0], 3.0]
+
+    report = examine(lambda x, w: cost(x), THETA, grad=noisy, noise=1, calls=20_000)
+    assert report.derivative_cause == "biased"
+    assert "usable to 10%. The bias of the mean gradient is below " in report.noise_answer
+
+
+def test_a_gradient_that_changes_within_a_thousandth_has_no_noise_of_a_short_float():
+    """As over many contacts, each of which begins at another step for neighbouring thetas."""
+    report = examine(cost, THETA, grad=lambda x: gradient(x) + 0.3 * np.sin(3e3 * x))
+    assert report.derivative == "wrong"
+    assert "short float" not in str(report)
+
+
 def test_sigma_by_input_is_a_range():
     report = examine(lambda x: float(x @ x), np.ones(4), grad=lambda x: 2 * x, sigma=[[0.02, 0.02, 20.0, 0.05]])
     assert "Under noise of sigma 0.020 to 20:" in report.noise_answer

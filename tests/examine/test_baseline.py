@@ -73,6 +73,7 @@ def test_settings_of_the_command_line(sim, capsys):
     assert run(f"{sim}:cost", "grad=off", "calls=400", *settings) == 0
     assert "small error, within the tolerance" in capsys.readouterr().out
     assert run(f"{sim}:cost", "expect=nonsense") == 2
+    assert run(f"{sim}:cost", "expect=nondeterministic") == 2  # which cannot hold
     assert run(f"{sim}:cost", "tolerance=1,2,3") == 2
 
 

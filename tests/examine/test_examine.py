@@ -84,7 +84,7 @@ MATRIX = np.arange(1.0, 7.0).reshape(2, 3)
 @pytest.mark.parametrize(
     ("theta", "turned", "said"),
     [
-        (np.ones(2), lambda g: g[:1], r"shape \(1,\), and theta has shape \(2,\)"),
+        (np.ones(2), lambda g: g[:1].tolist(), r"shape \(1,\), and theta has shape \(2,\)"),
         (MATRIX, lambda g: g.T.tolist(), r"shape \(3, 2\), and theta has shape \(2, 3\): is it transposed\?"),
         ({"w": MATRIX}, lambda g: {"w": g["w"].T}, r"shape w \(3, 2\), and theta has shape w \(2, 3\): is it trans"),
         (np.ones(4), lambda g: g[:, None], r"shape \(4, 1\), and theta has shape \(4,\)$"),
@@ -122,20 +122,16 @@ def shifted(x):
 
 
 @pytest.mark.parametrize(
-    ("cost", "theta", "settings", "names"),
+    ("cost", "theta", "settings"),
     [
-        (lambda p: p.pop("mass") ** 2, {"mass": 2.0}, {}, ["the cost"]),
-        (shifted, [1.0], {"grad": np.ones_like, "batch": "columns"}, ["the cost"]),
-        (shifted, [1.0], {"grad": lambda x: np.multiply(x, 0, out=x) + 1}, ["the cost", "the gradient"]),
-        (lambda x: x[0], [1.0], {"grad": lambda x: [1.0]}, []),
+        (lambda p: p.pop("mass") ** 2, {"mass": 2.0}, {}),
+        (shifted, [1.0], {"grad": np.ones_like, "batch": "columns"}),
+        (shifted, [1.0], {"grad": lambda x: np.multiply(x, 0, out=x) + 1}),
     ],
 )
-def test_changes_of_theta_are_named_and_change_no_verdict(cost, theta, settings, names):
+def test_changes_of_theta_change_no_verdict(cost, theta, settings):
     report = examine(cost, theta, calls=60, **settings)
     assert report.status == 0, str(report)
-    assert [text for text in report.warnings if "in place" in text] == [
-        f"{name} changes theta in place: each call gets a copy" for name in names
-    ]
 
 
 def test_scale_of_zero_is_that_of_its_array():
@@ -233,7 +229,7 @@ def test_bias_at_a_jump_is_that_of_the_closed_form():
     assert found.bias_low <= missed <= found.bias_high
     assert report.status == 1
     assert report.cause == "biased"
-    assert found.best.name == "smoothing"
+    assert (found.best.name, found.best.calls) == ("smoothing", 2 * found.best.samples)
     assert dataclasses.replace(report, expect="jumps").status == 0  # sigma measures what the jumps do
     assert dataclasses.replace(report, expect="jumps", lines=[]).status == 1  # a bias without jumps is not expected
 

@@ -11,7 +11,7 @@ from bench.plugins.studies.gradient_check.views import by_point
 from bench import run
 from bench.cli import main
 from bench.experiment.columns import IDENTITY
-from bench.gradient import FAULTS, VERDICTS
+from bench.gradient import FAULTS, TRUSTED, VERDICTS
 from bench.measure import noise
 from bench.model import Problem, compose, registry
 
@@ -91,6 +91,16 @@ def test_the_last_digits_of_equal_calls_may_differ(pendulum, of, size, is_repeat
 
     check = measure.start(Planted(pendulum, **{of: last}), pendulum.program.theta0, FLOAT64, SEARCH, 0)
     assert (check.cause != "nondeterministic") == is_repeated
+
+
+@pytest.mark.parametrize(("factor", "is_right"), [(1.0, True), (1.0001, False)])
+def test_a_gradient_by_differences_is_held_to_their_precision(factor, is_right):
+    """Beside a contact that switches within the step, the smallest of 50 components is off by 5e-4 of itself."""
+    problem = compiled(plugin("scenes", "pushing", horizon=50), plugin("contacts", "penalty"), backend="numpy")
+    planted = Planted(problem, grad=lambda g, _: factor * g)
+    planted.step = problem.step
+    check = measure.start(planted, problem.program.theta0, FLOAT64, SEARCH, 0)
+    assert (check.cause in TRUSTED) == is_right, check.sentence()
 
 
 def test_wrong_adjoint_is_seen_in_float32(pendulum):

@@ -206,8 +206,10 @@ def start(problem: Problem, theta: np.ndarray, unit: float, search: GradientChec
         return problem.grad(np.stack([theta, at], axis=1), still[:, :2])[:, -1]
 
     modes = contact_modes(problem)
-    named = None if modes is None else lambda thetas: modes(thetas, np.zeros((still.shape[0], thetas.shape[1])))
-    options = gradcheck.Options(directions=search.directions, draws=search.around, unit=unit, seed=seed)
+    named = None if modes is None else lambda thetas: modes(thetas, np.zeros((len(still), thetas.shape[1])))
+    options = gradcheck.Options(
+        directions=search.directions, draws=search.around, unit=unit, seed=seed, step=problem.step
+    )
     return gradcheck.check(
         cost, gradient, theta, options, named, lambda at, along: tangent(problem, at, along, still[:, 0])
     )
@@ -243,7 +245,7 @@ def complex_step(problem: Problem, theta: np.ndarray, direction: np.ndarray, w: 
             value = program.cost(
                 LoopOps(), theta[:, None] + 1j * size * direction[:, None], w[:, None].astype(complex)
             )[0]
-            real = problem.value(theta, w[:, None])[0]
+            real = problem.value(theta, w)
     except Exception:  # code of a plugin that does not run on complex numbers
         return math.nan
     # relative difference between the costs of two array libraries: a chaotic rollout amplifies their rounding
