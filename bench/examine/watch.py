@@ -72,7 +72,7 @@ class Watch:
     >>> log = Watch(lambda x: float(x @ x), every=1, share=math.inf)
     >>> log(np.array([1.0, 2.0]), np.array([2.0, 4.0]))
     >>> print(log)
-    1 of 1 iterations checked (1 smooth): no fault of the gradient
+    1 of 1 iterations checked (1 smooth): no fault above 10%
     """
 
     def __init__(
@@ -178,7 +178,7 @@ class Watch:
             text += f", {len(reasons)} with errors: {reasons[0]}"
         text += self._unwritten
         if self.first is None:
-            return f"{text}: {'no fault of the gradient' if verdicts else 'nothing is known of the gradient'}"
+            return f"{text}: {f'no fault above {USABLE:.0%}' if verdicts else 'nothing is known of the gradient'}"
         iteration, code = self.first
         meaning = RULES[code].meaning if code in RULES else MEANINGS[code]
         return f"{text}: of no use from iteration {iteration} on ({code}: {meaning})"

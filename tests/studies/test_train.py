@@ -192,6 +192,9 @@ def test_a_return_above_another_by_less_than_noise_is_not_behind():
     assert found["verdict"].tolist() == ["behind", "first"]
     assert found["behind"][0] == pytest.approx(1.9)
     assert found["behind_low"][0] < 1.9 < found["behind_high"][0]
+    # the test alone would find one here, of p = 0.03
+    wide = [np.array([50.0, 55.0, 57.0, 59.0, 235.0]), np.array([60.0, 70.0, 300.0, 400.0, 440.0])]
+    assert studied.ranked(lines.assign(returns=wide), ["group"])["verdict"].tolist() == ["open", "open"]
 
 
 @pytest.mark.parametrize(

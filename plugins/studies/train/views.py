@@ -94,13 +94,11 @@ VERDICTS = (
     "settings: how many of the trainer were tried. The best on the first third of the seeds (the choosing seeds, of which those count "
     "that all its settings have, if any) is chosen, the other "
     "seeds are reported; of fewer than 8 seeds all are reported, and choose. "
-    "verdict: first, tied (not distinguishable), behind (by a Mann-Whitney test at 5%), not chosen, or open: none is behind, or only "
+    "verdict: first, tied (not distinguishable), behind (by this interval and a Mann-Whitney test at 5%), not chosen, or open: none is behind, or only "
     "the first's larger number of settings puts it ahead (it would lead with the worst of as many settings). not run: chosen, but "
     "without reported seeds."
 )
-WINDOW_VERDICTS = (
-    "verdict: first, tied (not distinguishable), behind (by a Mann-Whitney test at 5%), or open where none is behind."
-)
+WINDOW_VERDICTS = "verdict: first, tied (not distinguishable), behind (by a bootstrap interval and a Mann-Whitney test at 5%), or open where none is behind."
 PAGE = (
     "final_return",
     "first_return",
@@ -223,8 +221,8 @@ def ranked(lines: pd.DataFrame, by: Sequence[str], trainer: str = "family") -> p
 
     ``behind`` is how much higher the first of its group ends than such a setting, with its interval.
 
-    ``first``: the highest return; ``behind``: its runs end lower than those of the first, by the test of Mann and Whitney (1947)
-    at 5%, even if the first had only its worst settings, as many as this one; ``tied``: the test finds no difference;
+    ``first``: the highest return; ``behind``: its runs end lower than those of the first, by this interval and the test of Mann and
+    Whitney (1947) at 5%, even if the first had only its worst settings, as many as this one; ``tied``: the test finds no difference;
     ``open``: neither, or none of the group is behind; ``not run``: the chosen setting has no seeds that are reported;
     ``no result``: no run ended with a finite return.
     """
@@ -255,13 +253,11 @@ def ranked(lines: pd.DataFrame, by: Sequence[str], trainer: str = "family") -> p
 
 
 def is_lower(returns: np.ndarray, others: np.ndarray) -> bool:
-    """Return whether runs end lower than others, by the test of Mann and Whitney at 5%; few runs do not tell."""
+    """Return whether runs end lower than others, by an interval above 0 and the test of Mann and Whitney, both at 5%."""
     from scipy.stats import mannwhitneyu
 
-    test = mannwhitneyu(others, returns)
-    is_above = test.statistic > len(returns) * len(others) / 2
-    # level of the test of a difference between two groups of runs
-    return bool(len(returns) >= MIN_SEEDS and test.pvalue < 0.05 and is_above)
+    distance = middle_with_interval("behind", returns, others)
+    return bool(distance["behind_low"] > 0.0 and mannwhitneyu(others, returns).pvalue < 0.05)
 
 
 def middle_with_interval(name: str, values: np.ndarray, *above: np.ndarray) -> dict[str, Any]:
