@@ -6,6 +6,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
@@ -16,9 +17,10 @@ from bench.claims.discovery import LESSONS
 from bench.claims.results import FAILED, ClaimResult
 from bench.errors import printable
 from bench.experiment.columns import Column, text
-from bench.experiment.views import Chart, Mark, Style, Table
+from bench.experiment.views import Chart, Mark, Table
 from bench.report.cells import readable
-from bench.report.colours import estimator_style
+from bench.report.colours import estimator_style, looks_by_name
+from bench.report.style import VARIANTS
 from bench.report.tables import escape_markdown, plain_markdown
 from bench.report.text import counted, duration, number
 
@@ -53,47 +55,33 @@ def chart(claim: type[Claim], result: ClaimResult) -> Chart | None:
     if not result.series:
         return None
     (place, places), *curves = result.series.items()
-    is_log = {axis: axis in claim.logarithmic for axis in "xy"}
     parts, styles = [], {}
-    drawn: list[np.ndarray] = []
     for label, series in curves:
         # a second column has the standard errors of means
         values = pd.DataFrame(np.reshape(series, (len(series), -1))).reindex(columns=[0, 1])
         low, high = (values[0] + side * 1.96 * values[1] for side in (-1, 1))
-        parts.append(
-            pd.DataFrame(
-                {
-                    "series": label,
-                    "x": places,
-                    "y": values[0],
-                    "low": low,
-                    "high": high,
-                }
-            )
-        )
-        with np.errstate(all="ignore"):
-            height = values[0].to_numpy()
-            height = np.log(height) if is_log["y"] else height
-        if any(
-            np.isclose(height, other, rtol=0.0, atol=0.01 * (np.nanmax(other) - np.nanmin(other))).mean() > 0.5
-            for other in drawn
-        ):
-            styles[label] = Style("#D55E00", "", (0, (2, 2)))  # both of two lines on top of each other are seen
-        drawn.append(height)
+        parts.append(pd.DataFrame({"series": label, "x": places, "y": values[0], "low": low, "high": high}))
         if estimator := ESTIMATORS.get(re.split(r"\W", label)[0]):
             styles[label] = estimator_style(estimator)
-    return Chart(
+    source, first = claim.source.partition(";")[0], re.split("[:;.] ", result.remark)[0]
+    drawn = Chart(
         claim.name,
         pd.concat(parts, ignore_index=True),
-        [Column("x", label=place, log=is_log["x"])],
-        [Column("y", label=claim.quantity, low="low", high="high", log=is_log["y"])],
+        [Column("x", label=place, log="x" in claim.logarithmic)],
+        [Column("y", label=claim.quantity, low="low", high="high", log="y" in claim.logarithmic)],
         "lines",
         claim.learned.partition(". ")[0],
         "series",
         styles=styles,
         marks=[Mark(label, value, axis=axis) for axis, value, label in claim.marks],
-        subtitle=f"{claim.name}, {claim.source.partition(';')[0]}: {result.verdict}",
+        subtitle=": ".join(filter(None, [f"{claim.name}, {source}: {result.verdict}", first])),
     )
+    # what is named alike before a colon has one colour; of two curves on top of each other both are seen
+    looks, heads = looks_by_name([drawn]), dict[str, str]()
+    for i, (label, _) in enumerate(curves):
+        head = heads.setdefault(label.partition(":")[0], label)
+        styles[label] = replace(looks[head], line=VARIANTS[i % 2])
+    return drawn
 
 
 def measured_text(value: float, error: float) -> str:

@@ -27,7 +27,7 @@ from bench.report.colours import looks_by_name
 from bench.report.names import in_words
 from bench.report.problems import value_text
 from bench.report.scales import LARGEST, SMALLEST, log_axis
-from bench.report.style import GREY, MARKS, SHADE, SIZE, filled, plain, width_in_inches
+from bench.report.style import GREY, MARKERS, MARKS, SHADE, SIZE, filled, plain, width_in_inches
 from bench.report.text import axis_value, number, short_duration
 from bench.report.views import is_logarithmic
 
@@ -55,6 +55,8 @@ CUT = SIZE + 1
 """Height of the line of such a number, in points."""
 BESIDE = 2.5
 """Distance in points of the marks of a panel's lines at the same place."""
+SIGNS = dict(zip(MARKERS, "●■◆▲▼✚✖★", strict=True))
+"""The letter that looks like each marker, before the number of a value beyond the axis."""
 HOLLOW: dict[str, Any] = {"markerfacecolor": "none"}
 NEAR = 20.0
 """Distance from which an arrow joins two points, in hundredths of an inch."""
@@ -284,8 +286,9 @@ def _draw_marks(chart: Chart, panel: Axes, name: str) -> None:
         if mark.to is None and low < mark.at < high:
             (panel.axvline if mark.axis == "x" else panel.axhline)(mark.at, zorder=1, **look)
         elif mark.to is not None and max(mark.at, low) < min(mark.to, high):
-            span = panel.axvspan if mark.axis == "x" else panel.axhspan
+            span, keep = (panel.axvspan, panel.set_xlim) if mark.axis == "x" else (panel.axhspan, panel.set_ylim)
             span(max(mark.at, low), min(mark.to, high), zorder=0, label=plain(mark.name), **BAND)
+            keep(low, high)  # the range reaches the end of the axis
 
 
 # -------------------------------------------------------------------------------------------- lines and points
@@ -355,7 +358,7 @@ def _draw_values(
     is_hollow, size = limit & bool(marker), 2.55 + 1.5 * style.width
     plot(
         places,
-        np.where(is_hollow | lost, math.nan, values),  # no line joins a limit to a value
+        np.where(is_hollow | lost, math.nan, values),  # dots lead to a limit
         marker=marker,
         markevery=~is_cut,
         linestyle=style.line if chart.kind == "lines" else "none",
@@ -365,6 +368,8 @@ def _draw_values(
         label=plain(style.meaning),
     )
     if is_hollow.any():
+        leads = ":" if chart.kind == "lines" else "none"
+        plot(places, np.where(lost, math.nan, values), linestyle=leads, linewidth=0.8)
         plot(places[limit], values[limit], marker=marker, linestyle="none", markersize=size, **HOLLOW)
         _name(panel, "upper limit", marker="o", **HOLLOW)
     if column.low and column.high:
@@ -374,7 +379,8 @@ def _draw_values(
         known = np.isfinite(low + high) & ~limit
         if known.any():
             mark = "s" if chart.band else "_" if is_flat else "|"
-            _name(panel, column.ends, marker=mark, markersize=9, alpha=0.3 if chart.band else 1.0)
+            look_of_key = {"alpha": 0.3, "color": GREY if chart.series else style.colour} if chart.band else {}
+            _name(panel, column.ends, marker=mark, markersize=9, **look_of_key)
         if chart.band:
             low, high = (np.where(known, end, np.nan) for end in (low, high))
             panel.fill_between(places, low, high, color=style.colour, alpha=0.18, linewidth=0, zorder=2)
@@ -387,12 +393,12 @@ def _draw_values(
         _name(panel, "beyond the axis, the largest as a number", **arrow)
         plot(places[is_cut], np.full(is_cut.sum(), 0.96), linestyle="none", transform=edge, **arrow)
         last = int(np.nanargmax(np.where(is_cut, given, np.nan)))
-        cuts = [text.get_text() for text in panel.texts if text.get_gid() == "cut"]
+        cuts = [text.get_text().split()[-1] for text in panel.texts if text.get_gid() == "cut"]
         label = number(given[last])
         at, above = ((1, places[last]), (2, -3)) if is_flat else ((places[last], 1), (0, 2 + CUT * len(cuts)))
         if label not in cuts:
             panel.annotate(
-                label,
+                f"{SIGNS.get(marker, '')} {label}",
                 at,
                 above,
                 xycoords=edge,

@@ -12,6 +12,7 @@ from bench.experiment.columns import Column
 from bench.experiment.views import Chart, Mark, Style
 from bench.report.draw import draw
 from bench.report.figures import save, styled
+from bench.report.names import short_names
 from bench.report.text import number
 from bench.run.files import make_directory, write_whole
 from bench.trace.spikes import MEASURES, align, spikes
@@ -83,7 +84,7 @@ def chart(trace: Trace) -> Chart:
         [Column("time", unit="s")],
         [Column("value", label=" ")],
         title="Where along the rollout does the gradient grow?",
-        subtitle=trace.title,
+        subtitle=short_names([trace.title], is_whole=True)[trace.title],
         series="series",
         line="line",
         panel="panel",

@@ -21,9 +21,7 @@ class Missed(Claim):
     )
     source = "Paulus et al. 2025, arXiv 2506.14186; shares from the geometry"
     origin = "recomputed"
-    learned = (
-        "A surrogate gradient sees what was missed and keeps the motion, but it is not the derivative of the program."
-    )
+    learned = "A surrogate gradient sees what was missed, and is not the program's derivative. It keeps the motion."
     quantity = "df / du0"
     quick = False
 

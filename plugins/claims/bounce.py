@@ -26,9 +26,7 @@ class TimeOfImpact(Claim):
         "sign is wrong at every step size."
     )
     source = SOURCE
-    learned = (
-        "A motion that is right to first order can have a derivative of the wrong sign, and refining does not help."
-    )
+    learned = "A motion that is right to first order can have a derivative of the wrong sign. Refining does not help."
     quantity = "final height [m]"
 
     def measure(self) -> Outcome:

@@ -32,7 +32,7 @@ class CentralPath(Claim):
     lesson = "The price of smoothing"
     statement = "Relaxing complementarity by kappa equals smoothing by Student t noise of two degrees of freedom."
     source = "Suh, Pang, Tedrake 2022; Pang et al. 2023"
-    learned = "Relaxed contact is contact smoothed by noise of heavy tails; only the relaxed one has no variance."
+    learned = "Relaxed contact is contact smoothed by noise of heavy tails. Only the relaxed one has no variance."
     revision = 2
     quantity = "derivative of the gap after it"
 

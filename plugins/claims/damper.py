@@ -31,7 +31,7 @@ class Damper(Claim):
     )
     source = "Zhong, Han, Brikis 2022, task 2; distances by an independent program"
     origin = "recomputed"
-    learned = "A stiff contact does not bias the first order; a force that jumps does, at any step."
+    learned = "A stiff contact does not bias the first order; a damper's force, which jumps, does at any step."
     quantity = "distance of first from zeroth order"
     logarithmic = "x"
     quick = False

@@ -45,7 +45,7 @@ class Throw(Claim):
         "penalty."
     )
     source = "Zhong, Han, Brikis 2022, arXiv 2207.05060, task 2"
-    learned = "A wrong gradient can still find a way, but a worse one; a contact law that moves otherwise can find a better one."
+    learned = "A wrong gradient can still find a way, but a worse one; a penalty, which moves otherwise, can find a better one."
     quantity = "squared distance to the target [m^2]"
     logarithmic = "y"
     quick = False
@@ -142,7 +142,7 @@ class ObliqueCollision(Claim):
         "derivative is corrected too, at .39494 with only the time of impact, and at .36158 with neither."
     )
     source = "Zhong, Han, Brikis 2023, arXiv 2305.00092"
-    learned = "Where the normal turns with the place of impact, the right position with a wrong velocity is worse than neither."
+    learned = "Where the normal turns with the place of impact, the right position with a wrong velocity (time of impact only) is worse than neither."
     quantity = "cost"
     logarithmic = "y"
     marks = (("y", OPTIMUM, "optimum"),)

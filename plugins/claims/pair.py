@@ -77,7 +77,7 @@ class ElasticPair(Claim):
         }
         figures: list[Figure] = []
         starts = np.linspace(-0.02, 0.02, 97)
-        series: dict[str, Any] = {"shift of the start of this ball [m]": starts}
+        curves: dict[str, Any] = {}
         for label, (law, integrator, published) in cases.items():
             at = problem(Pair(), law, integrator=integrator)
             still = np.zeros((at.program.n_noise, 1))
@@ -92,5 +92,5 @@ class ElasticPair(Claim):
             for ball, name in enumerate(("first", "second") if integrator != "event_driven" else ()):
                 theta = at.program.theta0[:, None] + np.eye(4)[:, [ball]] * starts
                 curve = at.value(theta, np.repeat(still, starts.size, axis=1))
-                series[f"{label}, {name} ball: slope {slopes[ball]:.0f}"] = curve
-        return Outcome(figures, series=series)
+                curves[f"{name} ball: {label}, slope {slopes[ball]:.0f}"] = curve
+        return Outcome(figures, series={"shift of the start of this ball [m]": starts} | dict(sorted(curves.items())))

@@ -93,7 +93,7 @@ class StiffPush(Claim):
     )
     source = "Suh et al. 2022, ICML; recomputed with a finer step"
     origin = "recomputed"
-    learned = "Two to three of the decades at k = 1000 are the step's, not the contact's: refine before you smooth."
+    learned = "Three decades of the first order's variance at k = 1000 are the step's, not the contact's: refine before you smooth."
     quantity = "variance of one sample"
     logarithmic = "xy"
     quick = False

@@ -249,6 +249,7 @@ def _charts(shown: Shown, good: pd.DataFrame) -> list[Chart]:
         "backward_memory": shown.column("memory_mb", limit="is_small", log=True),
         "backward_time": shown.column("gradient_s", label="time of a batch of gradients", log=True),
     }
+    small = f"; little is known below {SMALL:.0f} MiB"
     return [
         Chart(
             name,
@@ -259,7 +260,7 @@ def _charts(shown: Shown, good: pd.DataFrame) -> list[Chart]:
             panel="problem",
             across=2,
             title=f"How much {what} does the gradient of a long rollout take?",
-            subtitle=f"batches of {samples} rollouts on one thread, median of calls; little is known below {SMALL:.0f} MiB",
+            subtitle=f"batches of {samples} rollouts on one thread, median of calls" + small * (what == "memory"),
         )
         for what, (name, y) in zip(("memory", "time"), drawn.items(), strict=True)
     ]

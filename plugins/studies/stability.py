@@ -473,6 +473,7 @@ def charts(cells: pd.DataFrame, limit: float) -> list[Chart]:
         "" if e != e else (f"<{100 * min(GRADES):g}" if e < min(GRADES) else number(100 * e) if e < 10 else ">999")
         for e in frame["relative_error"]
     ]
+    near = f"Near 0: gradient and error are below {100 * limit:g}% of the scene's largest gradient. "
     found: list[Chart] = []
     for scene, part in frame.groupby("scene_name", sort=False):
         panel, note = "integrator", "Beside the limit a small error may be a coincidence of the phase"
@@ -496,8 +497,8 @@ def charts(cells: pd.DataFrame, limit: float) -> list[Chart]:
                 limit="stiffness_limit",
                 limit_name="stability limit of the step in theory",
                 panel_notes=dict.fromkeys(cells["step"][cells["stiffness"].isna()], "the same at any stiffness"),
-                subtitle=f"{name}. Number: error of the gradient, in % of the true one. Near 0: gradient and error are below {100 * limit:g}% "
-                f"of the scene's largest gradient. The worst of all backends. {note}",
+                subtitle=f"{name}. Number: error of the gradient, in % of the true one. {near * ('near 0' in {*part['level']})}"
+                f"The worst of all backends. {note}",
             )
         )
     return found

@@ -377,23 +377,38 @@ def test_time_to_an_error_is_drawn_per_backend_that_is_compared_and_with_what_ne
     never = {"bias": 2.0, "bias_low": 1.9, "bias_high": 2.1}
     cells = [
         cell(
-            e := n**-0.5, 0.9 * e, 1.1 * e, samples=n, sigma=s, backend=b, estimator=name, time_s=t * n, time_iqr_s=0.0
+            e := share * n**-0.5,
+            0.9 * e,
+            1.1 * e,
+            samples=n,
+            sigma=s,
+            backend=b,
+            estimator=name,
+            time_s=t * n,
+            time_iqr_s=0.0,
         )
         | bias
         for s in sigmas
         for n in samples
         for b, t in (("jax", 1e-5), ("mjx", 1e-3))
-        for name, bias in (("fobg", {}), ("inverse_variance", never | {"rmse_rel": 0.5}))
+        for name, share, bias in (
+            ("fobg", 1, {}),
+            ("plain", 0.1, {}),
+            ("inverse_variance", 1, never | {"rmse_rel": 0.5}),
+        )
     ]
     given = {"sweep": {"samples": samples, "sigma": sigmas}, "compares": {"backends": ["jax", "mjx"]}}
     chart = charts_of(table(cells), **given)["speed_accuracy"]
     assert (chart.kind, chart.failed_name) == ("grid", "not known to be reached")
-    found = {
-        "jax": ["fobg", "1 ms", "first, or tied: the 95% interval of its factor to the first reaches 1"],
-        "mjx": ["fobg", "100 ms", "10 or more times the first"],
-    }
+    first = "first, or tied: the 95% interval of its factor to the first reaches 1"
+    found = [
+        ("jax", "fobg", "1 ms", "below 10 times the first"),
+        ("mjx", "fobg", "100 ms", "10 or more times the first"),
+        ("jax", "plain", "<160 µs", first),
+        ("mjx", "plain", "<16 ms", "<: an upper limit, 10 or more times the first"),
+    ]
     assert chart.frame[["panel", "series", "cell", "grade"]].to_numpy().tolist() == [
-        [f"{backend}, sigma={s}", *found[backend]] for s in sigmas for backend in found
+        [f"{backend}, sigma={s}", *line] for s in sigmas for backend, *line in found
     ]
 
 
@@ -423,7 +438,9 @@ def test_two_values_of_an_axis_are_joined_by_an_arrow_and_below_are_the_costs_of
         figure = draw(chart)
     errors, below = figure.axes
     assert errors.get_xlim() == below.get_xlim()
-    assert below.get_title("left").endswith("costs of the same rollouts, changed by at\nmost 200%")
+    assert chart.subtitle.endswith(
+        "stiffness 100 to 10,000 N/m changes the costs by at most 200%: only the errors tell"
+    )
     assert "95% of the rollouts" in [text.get_text() for text in figure.legends[0].get_texts()]
 
 

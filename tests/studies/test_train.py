@@ -92,9 +92,13 @@ def test_a_setting_is_chosen_on_seeds_that_are_not_reported():
 
 @pytest.mark.parametrize(("count", "reported"), [(5, 5), (7, 7), (8, 5), (10, 6)])
 def test_seeds_choose_only_where_enough_are_left_for_a_test(count, reported):
-    summary = tables_of(*made_up(seeds=range(count)))["summary"].frame
+    """The chart of windows, which has all seeds, stated the number of the reported ones."""
+    shown = studied.views(*made_up(seeds=range(count)))
+    summary = shown.tables[1].frame
     assert set(summary["seeds"]) == {reported}
     assert summary["final_low"].notna().all()
+    for chart in shown.charts:
+        assert f" over {count if chart.name == 'windows' else reported} seeds" in chart.subtitle
 
 
 @pytest.mark.parametrize(("own", "verdict"), [(-500.0, "not chosen"), (-300.0, "not run")])

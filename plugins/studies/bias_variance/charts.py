@@ -44,6 +44,9 @@ GRADES = {0.1: "#08519c", 0.3: "#6baed6", 1.0: "#d6e6f4", 10.0: "#fdae61", math.
 BEHIND = {3.0: "#6baed6", 10.0: "#d6e6f4", math.inf: "#fdae61"}
 """Upper ends of the grades of a factor to the first method, and their colours."""
 FIRST = "first, or tied: the 95% interval of its factor to the first reaches 1"
+LIMIT = "<: an upper limit, 10 or more times the first"
+CLOSE = 0.03
+"""Largest relative difference of backends that are one line."""
 PANELS = 4
 """Most problems of a chart along an axis."""
 RMSE = Column(
@@ -79,14 +82,12 @@ def charts(
 ) -> list[Chart]:
     """Return all charts, the main one first."""
     labelled = replace(shown, rows=with_plotted_columns(shown.rows))
-    subtitle = _conditions(shown)
+    subtitle = _conditions(shown, shown.rows)
     swept = shown.swept()
     order = sorted(swept, key=lambda a: (-swept[a], a.column not in ("stiffness", "samples")))
     is_timed = shown.rows["time_s"].notna().any() and "contacts" not in shown.experiment.compares
     along = [
-        _cost_of_accuracy(shown, best, subtitle)
-        if axis.column == "samples" and is_timed
-        else _along(labelled, axis, subtitle)
+        _cost_of_accuracy(shown, best, subtitle) if axis.column == "samples" and is_timed else _along(labelled, axis)
         for i, axis in enumerate(order)
         if not any(axis.column in other.moves for other in order[:i])  # axes that step together have one chart
     ]
@@ -123,15 +124,15 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def _conditions(shown: Arranged) -> str:
-    """Return what all panels share: samples, medians over seeds, surrogate gradients."""
-    rows = shown.rows
-    scenes, samples, seeds = (rows[name].unique() for name in ("scene", "samples", "seed"))
+def _conditions(shown: Arranged, drawn: pd.DataFrame) -> str:
+    """Return what all panels share: samples of the ``drawn`` rows, medians over seeds, surrogate gradients."""
+    rows, samples = shown.rows, drawn["samples"].dropna().unique()
+    scenes, seeds = (rows[name].unique() for name in ("scene", "seed"))
     laws = rows.loc[rows["reason"].str.contains(SURROGATE, regex=False), "contact"].unique()
     return ", ".join(
         [
             *[*short_names(scenes).values()] * (len(scenes) == 1),
-            *[f"{samples[0]:g} samples"] * (len(samples) == 1),
+            *[f"{count:g} samples" for count in samples if len(samples) == 1],
             *[f"medians over {len(seeds)} seeds"] * (len(seeds) > 1),
             *(f"{law}: {SURROGATE}" for law in laws),
         ]
@@ -141,11 +142,7 @@ def _conditions(shown: Arranged) -> str:
 # ---------------------------------------------------------------------------------------------- along an axis
 
 
-def _along(
-    shown: Arranged,
-    axis: Axis,
-    subtitle: str,
-) -> Chart | None:
+def _along(shown: Arranged, axis: Axis) -> Chart | None:
     """Return the chart of errors along an axis, of the main estimators on the main problems."""
     always = ("scene",) * (shown.rows["scene"].nunique() > 1)
     problems = [p for p in split_by_problem(shown, axis, always) if attempted(p.rows)["x"].nunique() > 1]
@@ -163,6 +160,11 @@ def _along(
     for column, kept in (("label", names), ("problem", [problem.title() for problem in drawn])):
         frame = frame[frame[column].isin(kept)]
         frame = frame.iloc[frame[column].map(kept.index).argsort(kind="stable")]
+    notes += ["backends that agree lie on each other"] * (compared == "backend")
+    notes += [f"in brackets: a backend that differs by over {CLOSE:.0%}"] * frame["series"].str.contains(
+        " (", regex=False
+    ).any()
+    of_steps = frame[frame["horizon"].notna() & (axis.unit == "steps")]
     marks = [Mark(f"beyond the {name}", value, math.inf) for name, value in shown.marks(axis).items()]
     stem, what, y = "bias_variance", "error", [RMSE, BIAS]
     if axis.column == "samples" and compared == "contact":
@@ -184,12 +186,13 @@ def _along(
                 None,
                 [
                     f"{axis.short}: {axis.doc}" * (axis.doc != "" and axis.column not in COMMON),
-                    subtitle,
+                    _conditions(shown, frame),
                     *notes,
                     *shares,
                 ],
             )
         ),
+        panel_notes=dict(zip(of_steps["panel"], of_steps["horizon"].map("rollouts of {:g} steps".format), strict=True)),
     )
 
 
@@ -203,7 +206,7 @@ def _lines(problem: ProblemRows, compared: str, names: Sequence[str]) -> pd.Data
 
     Backends that agree are one line unless they are compared.
     """
-    curves = estimator_curves(problem.rows, None if compared == "backend" else 0.03).assign(problem=problem.title())
+    curves = estimator_curves(problem.rows, None if compared == "backend" else CLOSE).assign(problem=problem.title())
     if compared:
         others = joined({**problem.identity, compared: ""})
         curves = curves[_is_named(curves[compared], names)]
@@ -292,14 +295,17 @@ def _error_and_time(shown: Arranged, subtitle: str) -> Chart | None:
     # one program at both settings: what differs is noise
     frame = frame.assign(**{TIME: pairs[TIME].transform("median")}, arrow=frame["series"] + ", " + frame["panel"])
     moved = ((pairs["cost"].max() - pairs["cost"].min()) / pairs["cost"].mean().abs()).max()
-    below = replace(COST, doc=f"costs of the same rollouts, changed by at most {number(100 * moved)}%")
+    is_costed = bool(moved == moved)
+    change = f"{along.column} {' to '.join(f'{end:,g}' for end in ends)} {along.unit}".rstrip()
+    look_right = f"; {change} changes the costs by at most {number(100 * moved)}%: only the errors tell"
     return replace(
         chart,
         name="contrast",
         frame=frame,
-        y=[replace(RMSE, low="", high=""), *[below] * bool(moved == moved)],
+        y=[replace(RMSE, low="", high=""), *[replace(COST, doc="costs of the same rollouts")] * is_costed],
+        subtitle=chart.subtitle + look_right * is_costed,
         arrow="arrow",
-        arrow_name=f"{along.column} {' to '.join(f'{end:,g}' for end in ends)} {along.unit}".rstrip(),
+        arrow_name=change,
     )
 
 
@@ -344,9 +350,13 @@ def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Cha
     differs = bool(frame.groupby("problem")["title"].nunique().max() > 1)
     frame["panel"] = titled(frame, ["backend"] * bool(backends) + ["panel"] * differs)
     grades, looks = graded(factor, BEHIND, "{} times the first".format, "{:g}".format)
+    is_open = (frame["sign"] != "") & (grades == [*looks][-1])  # fewer samples may do
     return Chart(
         "speed_accuracy",
-        frame.assign(grade=grades.mask(frame["leads"], FIRST), cell=frame["sign"] + frame["cost"].map(short_duration)),
+        frame.assign(
+            grade=grades.mask(is_open, LIMIT).mask(frame["leads"], FIRST),
+            cell=frame["sign"] + frame["cost"].map(short_duration),
+        ),
         [text("problem", label="")],
         [ESTIMATOR],
         "grid",
@@ -354,7 +364,7 @@ def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Cha
         level="grade",
         cell="cell",
         across=1,
-        styles={FIRST: Style(GRADES[0.1])} | looks,
+        styles={FIRST: Style(GRADES[0.1])} | looks | {LIMIT: Style("#bdbdbd")},
         failed_name="not known to be reached",
         title=f"Which method reaches an error of {target:.0%} first?",
         subtitle=", ".join(

@@ -14,10 +14,11 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import PROBLEM
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.gradient import BROKEN, FAULTS, RULES, TRUSTED, UNDECIDED, VERDICTS
+from bench.report.names import short_names
 from bench.report.problems import axes_of, label_columns, problem_names, problem_numbers
 from bench.report.reproduce import own_plugins
 from bench.report.style import PALETTE
-from bench.report.text import counted
+from bench.report.text import counted, listed
 from bench.report.views import Arranged, arrange
 from bench.report.writer import reasons
 
@@ -247,5 +248,5 @@ def _grid(points: pd.DataFrame) -> Chart:
         cell="letter",
         styles={letter: style for letter, (_, style) in KINDS.items()},
         failed_name="no switch of contact, or no fault under noise, was found",
-        subtitle=f"the worst verdict over all checks on {' and '.join(points['backend'].unique())}",
+        subtitle=f"the worst verdict over all checks on the backends that run: {listed(short_names(points['backend'], True).values())}",
     )

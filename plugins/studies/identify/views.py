@@ -190,7 +190,8 @@ def charts(lines: pd.DataFrame, fits: Sequence[Column]) -> list[Chart]:
     drawn = {column.heading: column.name for column in fits if lines[column.name].notna().any()}
     if not drawn:
         return []
-    frame = stacked(lines, drawn, "value")
+    names = {"single": "single shooting", "multiple": "multiple shooting", "windows": "independent windows"}
+    frame = stacked(lines.assign(shooting=lines["shooting"].map(names)), drawn, "value")
     ideals = zip(fits, (1.0, LEVEL), ("Cramer-Rao bound", f"stated, {LEVEL:.0%}"), strict=True)
     marks = [Mark(name, ideal, panel=column.heading) for column, ideal, name in ideals]
     frame = frame.assign(failed=(frame["converged"] == 0) & (frame["series"] == fits[0].heading))
@@ -208,5 +209,6 @@ def charts(lines: pd.DataFrame, fits: Sequence[Column]) -> list[Chart]:
             failed_name="no fit converges",
             own_scales=True,
             across=2,
+            subtitle=f"{lines['fits'].max():g} noisy records of each; windows need a measurement after each step",
         )
     ]

@@ -434,7 +434,7 @@ def _along(runs: RunSet, axis: Axis, where: str) -> Chart:
         "tunings",
         pd.DataFrame(lines),
         [setting(axis.column, label=axis.title, log=True)],
-        [replace(SCORE, label="share of the way to the lowest cost known")],
+        [replace(SCORE, label="share of the way to the lowest cost known", ends=REACHED.ends)],
         series="method",
         subtitle=f"{where} with the same {axis.short}, interquartile mean of searches",
     )

@@ -18,6 +18,7 @@ from bench.experiment.views import Chart, Table, Views
 from bench.measure.performance import bootstrap, interquartile_mean
 from bench.measure.statistics import ends
 from bench.report.problems import problem_names
+from bench.report.text import axis_value
 from bench.report.views import arrange, attempted
 
 from .. import PARTS
@@ -365,7 +366,10 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
 
 def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
     frame = curves_of(runs)
-    middles = f"lower is better; interquartile mean over {runs['seed'].nunique()} seeds"
+    middles, of_windows = (
+        f"lower is better; interquartile mean over {' to '.join(dict.fromkeys(map(axis_value, counts.agg(['min', 'max']))))} seeds"
+        for counts in (runs.groupby(["problem", "method"]).size(), windows["seeds"])
+    )
     cost = replace(COST, log=bool((frame["cost"] > 0).all()))
     curves = Chart(
         "train",
@@ -394,6 +398,6 @@ def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
         series="family",
         panel="problem",
         title="What does the length of a window do?",
-        subtitle=f"after training; {middles}",
+        subtitle=f"after training; {of_windows}",
     )
     return [curves, times, lengths]
