@@ -276,19 +276,17 @@ def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[float] = ()) 
 def _draw_marks(chart: Chart, panel: Axes, name: str) -> None:
     """Draw the named values and ranges of the axes; values without a name are quiet lines, not to be taken for a series."""
     names = list(dict.fromkeys(mark.name for mark in chart.marks if mark.name and mark.to is None))
-    for mark in chart.marks:
-        low, high = panel.get_xlim() if mark.axis == "x" else panel.get_ylim()
+    for mark in (mark for mark in chart.marks if mark.panel in (None, name)):
+        low, high = getattr(panel, f"get_{mark.axis}lim")()
+        kind = "axv" if mark.axis == "x" else "axh"
         look: dict[str, Any] = {"label": plain(mark.name), "linewidth": 0.9, "color": "#c0c0c0"}
         if mark.name in names:
             look |= {"color": "#595959", "linestyle": MARKS[names.index(mark.name) % len(MARKS)]}
-        if mark.panel not in (None, name):
-            continue
         if mark.to is None and low < mark.at < high:
-            (panel.axvline if mark.axis == "x" else panel.axhline)(mark.at, zorder=1, **look)
-        elif mark.to is not None and max(mark.at, low) < min(mark.to, high):
-            span, keep = (panel.axvspan, panel.set_xlim) if mark.axis == "x" else (panel.axhspan, panel.set_ylim)
-            span(max(mark.at, low), min(mark.to, high), zorder=0, label=plain(mark.name), **BAND)
-            keep(low, high)  # the range reaches the end of the axis
+            getattr(panel, f"{kind}line")(mark.at, zorder=1, **look)
+        elif mark.to is not None and (start := max(mark.at, low)) < (end := min(mark.to, high)):
+            getattr(panel, f"{kind}span")(start, end, zorder=0, label=look["label"], **BAND)
+            getattr(panel, f"set_{mark.axis}lim")(low, high)  # the range reaches the end of the axis
 
 
 # -------------------------------------------------------------------------------------------- lines and points
@@ -368,9 +366,8 @@ def _draw_values(
         label=plain(style.meaning),
     )
     if is_hollow.any():
-        leads = ":" if chart.kind == "lines" else "none"
-        plot(places, np.where(lost, math.nan, values), linestyle=leads, linewidth=0.8)
-        plot(places[limit], values[limit], marker=marker, linestyle="none", markersize=size, **HOLLOW)
+        shown, leads = np.where(lost, math.nan, values), ":" if chart.kind == "lines" else "none"
+        plot(places, shown, marker=marker, markevery=limit, linestyle=leads, linewidth=0.8, markersize=size, **HOLLOW)
         _name(panel, "upper limit", marker="o", **HOLLOW)
     if column.low and column.high:
         low, high = (points[end].to_numpy(float) for end in (column.low, column.high))
@@ -379,8 +376,8 @@ def _draw_values(
         known = np.isfinite(low + high) & ~limit
         if known.any():
             mark = "s" if chart.band else "_" if is_flat else "|"
-            look_of_key = {"alpha": 0.3, "color": GREY if chart.series else style.colour} if chart.band else {}
-            _name(panel, column.ends, marker=mark, markersize=9, **look_of_key)
+            key, alpha = GREY if chart.series else style.colour, 0.3 if chart.band else 1.0
+            _name(panel, column.ends, marker=mark, markersize=9, color=key, alpha=alpha)
         if chart.band:
             low, high = (np.where(known, end, np.nan) for end in (low, high))
             panel.fill_between(places, low, high, color=style.colour, alpha=0.18, linewidth=0, zorder=2)

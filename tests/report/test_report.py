@@ -167,12 +167,10 @@ def test_a_value_of_0_is_hollow_and_a_useless_one_a_number_that_stands_outside_i
     frame = pd.DataFrame({"x": [1.0, 2.0, 3.0] * 2, "rmse_rel": [0.0, 1e3, 1e4, 0.2, 0.3, 1e24], "name": [*"aaabbb"]})
     chart = Chart("one", frame, [Column("x", log=False)], [replace(RMSE, low="", high="", limit="")], series="name")
     (panel,) = figure_of(chart).axes
-    hollow = [
-        list(line.get_ydata()) for line in panel.lines if line.get_markerfacecolor() == "none" and len(line.get_ydata())
-    ]
-    assert hollow == [[FLOOR]]
+    hollow = [line for line in panel.lines if line.get_markerfacecolor() == "none" and len(line.get_ydata())]
+    assert [list(line.get_ydata()[line.get_markevery()]) for line in hollow] == [[FLOOR]]
     assert np.isnan(panel.lines[0].get_ydata()[0])
-    assert [text.get_text() for text in panel.texts] == ["1.0e4", "1.0e24"]
+    assert [text.get_text() for text in panel.texts] == ["● 1.0e4", "■ 1.0e24"], "each with its marker"
     arrows = [line.get_xdata().tolist() for line in panel.lines if line.get_marker() == "$↑$" and len(line.get_xdata())]
     assert arrows == [[2.0, 3.0], [3.0]]
     assert panel.lines[0].get_ydata()[-1] == 1e4, "a line leads to a value beyond the axis, and shows no plateau"

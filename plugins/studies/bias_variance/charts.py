@@ -69,7 +69,7 @@ BIAS = Column(
     least=FLOOR,
     above_one="larger than the gradient",
 )
-COST = interval("cost", log=False, ends="95% of the rollouts")
+COST = interval("cost", log=False, ends="95% of the rollouts", doc="costs of the same rollouts")
 SECONDS = replace(COLUMNS.by_name["time_s"], label="time of one estimate", log=True)
 FASTEST = "each estimator on its fastest backend"
 ESTIMATOR = text("series", label="")
@@ -161,9 +161,6 @@ def _along(shown: Arranged, axis: Axis) -> Chart | None:
         frame = frame[frame[column].isin(kept)]
         frame = frame.iloc[frame[column].map(kept.index).argsort(kind="stable")]
     notes += ["backends that agree lie on each other"] * (compared == "backend")
-    notes += [f"in brackets: a backend that differs by over {CLOSE:.0%}"] * frame["series"].str.contains(
-        " (", regex=False
-    ).any()
     of_steps = frame[frame["horizon"].notna() & (axis.unit == "steps")]
     marks = [Mark(f"beyond the {name}", value, math.inf) for name, value in shown.marks(axis).items()]
     stem, what, y = "bias_variance", "error", [RMSE, BIAS]
@@ -218,7 +215,8 @@ def _lines(problem: ProblemRows, compared: str, names: Sequence[str]) -> pd.Data
         )
     # those that differ from the first are named after their backends
     first = curves["curve"] == curves.groupby("label")["curve"].transform("min")
-    return curves.assign(series=curves["label"].where(first, curves["method"]), panel=problem.title())
+    other = curves["method"] + f": over {CLOSE:.0%} apart"
+    return curves.assign(series=curves["label"].where(first, other), panel=problem.title())
 
 
 def _looks(names: Sequence[str]) -> dict[str, Style]:
@@ -294,7 +292,7 @@ def _error_and_time(shown: Arranged, subtitle: str) -> Chart | None:
     pairs = frame.groupby(pair)
     # one program at both settings: what differs is noise
     frame = frame.assign(**{TIME: pairs[TIME].transform("median")}, arrow=frame["series"] + ", " + frame["panel"])
-    moved = ((pairs["cost"].max() - pairs["cost"].min()) / pairs["cost"].mean().abs()).max()
+    moved = (pairs["cost"].agg(np.ptp) / pairs["cost"].mean().abs()).max()
     is_costed = bool(moved == moved)
     change = f"{along.column} {' to '.join(f'{end:,g}' for end in ends)} {along.unit}".rstrip()
     look_right = f"; {change} changes the costs by at most {number(100 * moved)}%: only the errors tell"
@@ -302,7 +300,7 @@ def _error_and_time(shown: Arranged, subtitle: str) -> Chart | None:
         chart,
         name="contrast",
         frame=frame,
-        y=[replace(RMSE, low="", high=""), *[replace(COST, doc="costs of the same rollouts")] * is_costed],
+        y=[replace(RMSE, low="", high=""), *[COST] * is_costed],
         subtitle=chart.subtitle + look_right * is_costed,
         arrow="arrow",
         arrow_name=change,
@@ -350,11 +348,11 @@ def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Cha
     differs = bool(frame.groupby("problem")["title"].nunique().max() > 1)
     frame["panel"] = titled(frame, ["backend"] * bool(backends) + ["panel"] * differs)
     grades, looks = graded(factor, BEHIND, "{} times the first".format, "{:g}".format)
-    is_open = (frame["sign"] != "") & (grades == [*looks][-1])  # fewer samples may do
+    grades = grades.mask((frame["sign"] == "<") & (factor >= 10.0), LIMIT)  # fewer samples may do
     return Chart(
         "speed_accuracy",
         frame.assign(
-            grade=grades.mask(is_open, LIMIT).mask(frame["leads"], FIRST),
+            grade=grades.mask(frame["leads"], FIRST),
             cell=frame["sign"] + frame["cost"].map(short_duration),
         ),
         [text("problem", label="")],

@@ -18,7 +18,6 @@ from bench.experiment.views import Chart, Table, Views
 from bench.measure.performance import bootstrap, interquartile_mean
 from bench.measure.statistics import ends
 from bench.report.problems import problem_names
-from bench.report.text import axis_value
 from bench.report.views import arrange, attempted
 
 from .. import PARTS
@@ -366,10 +365,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
 
 def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
     frame = curves_of(runs)
-    middles, of_windows = (
-        f"lower is better; interquartile mean over {' to '.join(dict.fromkeys(map(axis_value, counts.agg(['min', 'max']))))} seeds"
-        for counts in (runs.groupby(["problem", "method"]).size(), windows["seeds"])
-    )
+    middles = "lower is better; interquartile mean over {:g} seeds".format
+    reported = middles(runs["seed"].nunique())
     cost = replace(COST, log=bool((frame["cost"] > 0).all()))
     curves = Chart(
         "train",
@@ -379,7 +376,7 @@ def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
         series="method",
         panel="problem",
         band=True,
-        subtitle=middles,
+        subtitle=reported,
     )
     times = replace(
         curves,
@@ -387,7 +384,7 @@ def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
         frame=frame[frame["time"] > 0],
         x=[TIME],
         title="Which return is reached after which time of updates?",
-        subtitle=f"{middles}, median time of runs beside other work",
+        subtitle=f"{reported}, median time of runs beside other work",
     )
     final = windows.assign(cost=-windows["final"], cost_low=-windows["final_high"], cost_high=-windows["final_low"])
     lengths = Chart(
@@ -398,6 +395,6 @@ def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
         series="family",
         panel="problem",
         title="What does the length of a window do?",
-        subtitle=f"after training; {of_windows}",
+        subtitle=f"after training; {middles(windows['seeds'].max())}",
     )
     return [curves, times, lengths]
