@@ -20,7 +20,6 @@ from bench.experiment.columns import Column, text
 from bench.experiment.views import Chart, Mark, Table
 from bench.report.cells import readable
 from bench.report.colours import estimator_style, looks_by_name
-from bench.report.style import VARIANTS
 from bench.report.tables import escape_markdown, plain_markdown
 from bench.report.text import counted, duration, number
 
@@ -80,7 +79,7 @@ def chart(claim: type[Claim], result: ClaimResult) -> Chart | None:
     looks, heads = looks_by_name([drawn]), dict[str, str]()
     for i, (label, _) in enumerate(curves):
         head = heads.setdefault(label.partition(":")[0], label)
-        styles[label] = replace(looks[head], line=VARIANTS[i % 2])
+        styles[label] = replace(looks[head], line=["-", (0, (2, 2))][i % 2])
     return drawn
 
 

@@ -176,8 +176,7 @@ def _frame(figure: Figure, chart: Chart, first: Sequence[str]) -> None:
     drawn = {
         name: handle for panel in figure.axes for handle, name in zip(*panel.get_legend_handles_labels(), strict=True)
     }
-    places = {plain(name): place for place, name in enumerate(first)}
-    names = sorted(drawn, key=lambda name: places.get(name, len(places)))
+    names = [name for name in dict.fromkeys([*map(plain, first), *drawn]) if name in drawn]
     if drawn:
         labels = [_wrapped(name, width - 0.6) for name in names]
         figure.legend(
@@ -240,7 +239,7 @@ def _scale(
 
     Marks among the drawn values are in view, and the area above 1 is shaded where that means something.
     """
-    axis, values = panel.xaxis if which == "x" else panel.yaxis, rows[column.name]
+    axis, values = getattr(panel, f"{which}axis"), rows[column.name]
     if not pd.api.types.is_numeric_dtype(values):
         axis.set_tick_params(rotation=30)
         return
@@ -379,8 +378,7 @@ def _draw_values(
             key, alpha = GREY if chart.series else style.colour, 0.3 if chart.band else 1.0
             _name(panel, column.ends, marker=mark, markersize=9, color=key, alpha=alpha)
         if chart.band:
-            low, high = (np.where(known, end, np.nan) for end in (low, high))
-            panel.fill_between(places, low, high, color=style.colour, alpha=0.18, linewidth=0, zorder=2)
+            panel.fill_between(places, low, high, known, color=style.colour, alpha=0.18, linewidth=0, zorder=2)
         else:
             bars = panel.hlines if is_flat else panel.vlines
             ends = bars(places[known], low[known], high[known], linewidth=1.0, **look)

@@ -116,7 +116,7 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
     }
     good = rows["status"] == "ok"
     return rows.assign(
-        **{name: column.where(good) for name, column in values.items()},
+        **pd.DataFrame(values).where(good),
         rmse_limit=is_limit,
         bias_limit=limit,
         series=estimator_labels(rows),

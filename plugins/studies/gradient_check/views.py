@@ -248,5 +248,5 @@ def _grid(points: pd.DataFrame) -> Chart:
         cell="letter",
         styles={letter: style for letter, (_, style) in KINDS.items()},
         failed_name="no switch of contact, or no fault under noise, was found",
-        subtitle=f"the worst verdict over all checks on the backends that run: {listed(short_names(points['backend'], True).values())}",
+        subtitle=f"the worst verdict over all checks on the backends that run: {listed(short_names(points['backend']).values())}",
     )
