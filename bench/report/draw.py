@@ -6,9 +6,10 @@ No text is cut: a long one breaks into lines, and what it names gets higher.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any, Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,10 +20,10 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FixedLocator
-from matplotlib.transforms import ScaledTranslation
+from matplotlib.transforms import offset_copy
 
 from bench.experiment.columns import Column
-from bench.experiment.views import Chart, Style
+from bench.experiment.views import Chart, Mark, Style
 from bench.report.colours import looks_by_name
 from bench.report.names import in_words
 from bench.report.problems import value_text
@@ -72,95 +73,169 @@ def draw(chart: Chart, is_narrow: bool = False) -> Figure:
     If ``is_narrow`` it is one column wide, with one panel across. Names are shortened: see :mod:`bench.report.names`.
     """
     chart = in_words(chart)
-    parts = [(str(name), part) for name, part in chart.frame.groupby(chart.panel, sort=False)] if chart.panel else []
-    parts = parts or [("", chart.frame)]
-    is_plot = chart.kind in ("lines", "points")
-    # quantities of the same runs above each other have one scale of x, so that their features can be compared
-    stacked = chart.own_scales and is_plot
-    panels = [(name, part, y) for y in chart.y[: len(chart.y) if stacked else 1] for name, part in parts]
-    most = 1 if is_narrow or not chart.panel else chart.across
-    width = NARROW if is_narrow or (is_plot and (len(parts) == 1 or not chart.panel)) else WIDTH
-    down = math.ceil(len(panels) / max(1, min(most, len(parts))))
-    across = math.ceil(len(panels) / down)
-    is_keyed = chart.kind != "dots" or chart.series != chart.y[0].name  # else each row has its name
-    styles = {
-        name: replace(style, meaning=(style.meaning or name) * is_keyed)
-        for name, style in looks_by_name([chart]).items()
-    }
-
-    rows = [[] if is_plot else _categories(y, part, downwards=True) for _, part, y in panels]
-    # panels with the same rows have labels once, at the left
-    shared = not chart.own_scales if is_plot else all(names == rows[0] for names in rows)
-    beside = 1 if shared else across
-    room = (0.46 if shared else 0.42 / across) * width
-    labels = [[_wrapped(name, room) for name in names] for names in rows]
-    written = [text for names in labels for text in names]
-    inner = (width - beside * (0.85 if is_plot else max(map(_text_width, written), default=0.0))) / across - 0.12
-    is_spread = chart.kind == "dots" and not chart.join and chart.series not in ("", chart.y[0].name)
-    row = max([ROW, DOT * len(styles) * is_spread, *(LINE * (1 + text.count("\n")) + 0.015 for text in written)])
-    heights = [
-        (chart.height if is_plot else row * len(names) + 0.1) * (1.0 if y is chart.y[0] else BELOW)
-        for names, (*_, y) in zip(rows, panels, strict=True)
-    ]
-    ratios = [max(heights[i * across : (i + 1) * across]) for i in range(down)]
+    # a column that the chart does not name is the one without a name, which is empty
+    layout = _layout(_panels(replace(chart, frame=chart.frame.assign(**{"": ""}))), is_narrow)
     engine = ConstrainedLayoutEngine(w_pad=0.04, h_pad=PAD, rect=(0.006, 0, 0.988, 1))
-    figure = Figure(figsize=(width, 4 + 2 * sum(ratios)), layout=engine)
+    figure = Figure(figsize=(layout.width, 4 + 2 * sum(layout.ratios)), layout=engine)
     FigureCanvasAgg(figure)
+    first = layout.panels[0]
     grid = figure.subplots(
-        down,
-        across,
+        len(layout.ratios),
+        layout.across,
         squeeze=False,
-        sharey=is_plot and (shared or (chart.across > 1 and "row")),
-        height_ratios=ratios,
-        sharex=stacked or (not chart.own_scales and chart.kind == "dots"),
+        sharex=first.has_common_x,
+        sharey=first.is_plot and ("row" if chart.own_scales else "all"),
+        height_ratios=layout.ratios,
     ).ravel()
-    for spare in grid[len(panels) :]:
+    for spare in grid[len(layout.panels) :]:
         spare.remove()
-    for place, (panel, (name, part, y), names) in enumerate(zip(grid, panels, rows, strict=False)):
-        is_left, is_last = place % across == 0 or not shared, place + across >= len(panels)
-        if is_plot:
-            scaled = part if stacked and chart.across == 1 else chart.frame
-            _draw_lines(chart, panel, part, styles, y, _is_log(y, scaled[y.name]))
-            few = all(p[chart.x[0].name].nunique() <= 6 for _, p in parts)
-            _scale(chart, panel, "x", chart.x[0], chart.frame if stacked else part, few)
-            _scale(chart, panel, "y", y, scaled)
-            if y is not chart.y[0]:
-                panel.margins(y=0.4)
-            elif chart.arrow:
-                _draw_arrows(chart, panel, part, styles)
-            panel.set_xlabel("" if stacked and not is_last else _wrapped(chart.x[0].heading, inner))
-            panel.set_ylabel(_wrapped(y.heading, heights[place]) if place % across == 0 else "")
-        else:
-            panel.set_yticks(range(len(names)), labels[place][::-1])
-            panel.set_ylim(-0.5, len(names) - 0.5)
-            panel.tick_params(axis="y", length=0, labelleft=is_left)
-            is_named = is_left and (y.label or y.kind == "number")
-            panel.set_ylabel(_wrapped(y.heading, heights[place]) if is_named else "")
-            cells = {label: len(names) - 1 - i for i, label in enumerate(names)}
-            if chart.kind == "dots":
-                _draw_dots(chart, panel, part, styles, cells)
-            else:
-                _draw_grid(chart, panel, part, styles, cells, inner)
-            panel.tick_params(labelbottom=is_last or chart.own_scales)
-            if not is_last and not chart.own_scales:
-                panel.set_xlabel("")
-        _draw_marks(chart, panel, name)
-        is_first = y is chart.y[0]
-        is_named = (len(parts) > 1 or not chart.subtitle.startswith(name)) and (is_first or across == 1)
-        texts = name * is_named, chart.panel_notes.get(name, "") if is_first else y.doc
-        title = [_wrapped(text, inner) for text in texts if text]
-        # values beyond the panel are written between it and its title
-        cuts = sum(text.get_gid() == "cut" for text in panel.texts)
-        panel.set_title("\n".join(title), loc="left", fontsize=SIZE, pad=4 + CUT * cuts)
-    _frame(figure, chart, [style.meaning for style in styles.values()])
+    for place in range(len(layout.panels)):
+        _draw_panel(grid[place], layout, place)
+    _frame(figure, chart, [plain(style.meaning) for style in first.styles.values()])
     engine.execute(figure)
-    drawn = figure.get_figheight() * sum(panel.get_position().height for panel in grid[::across])
-    figure.set_figheight(figure.get_figheight() + sum(ratios) - drawn)
+    drawn = figure.get_figheight() * sum(axes.get_position().height for axes in grid[:: layout.across])
+    figure.set_figheight(figure.get_figheight() + sum(layout.ratios) - drawn)
     figure.texts[0].set_y(1 - PAD / figure.get_figheight())
     return figure
 
 
-# ------------------------------------------------------------------------------------- title, legend and texts
+# ------------------------------------------------------------------------------------------------------ layout
+
+
+@dataclass(frozen=True)
+class Panel:
+    """What a panel shows: the rows with one value of the column ``chart.panel``, and one quantity y."""
+
+    chart: Chart
+    styles: Mapping[str, Style]
+    name: str
+    rows: pd.DataFrame
+    x: Column
+    y: Column
+    is_plot: bool
+    """Whether it has points at numbers of y; else it has a row per category of y."""
+    is_first: bool
+    """Whether y is the first quantity of the chart."""
+    has_common_x: bool
+    """Whether all panels have one scale of x, so that features of quantities above each other can be compared."""
+    categories: Sequence[str]
+    """The names of its rows of dots or cells, from the top."""
+    value: Column
+    """The measured quantity: y of a plot, x of dots."""
+    scaled: pd.DataFrame
+    """The rows that decide the scale of the measured quantity."""
+
+    def heights(self, rows: pd.DataFrame) -> np.ndarray:
+        """Return the height of the category of each row, from 0 for the lowest."""
+        return pd.Categorical(rows[self.y.name].map(value_text), self.categories[::-1]).codes
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The panels of a chart, row by row, with the names of their rows in lines, and their sizes in inches."""
+
+    panels: Sequence[Panel]
+    across: int
+    width: float
+    inner: float
+    """The width of a panel without the labels of its y axis."""
+    heights: Sequence[float]
+    labels: Sequence[Sequence[str]]
+    is_shared: bool
+    """Whether panels beside each other have the same scale or rows, with labels once, at the left."""
+
+    ratios: Sequence[float]
+    """The height of each row of panels."""
+
+
+def _panels(chart: Chart) -> list[Panel]:
+    """Return a panel per part of a chart; of plots with their own scales there are as many for each quantity."""
+    is_named = chart.kind != "dots" or chart.series != chart.y[0].name  # else each row has its name
+    styles = {
+        name: replace(
+            style,
+            line=style.line if chart.kind == "lines" else "none",
+            meaning=(style.meaning or name) * is_named,
+        )
+        for name, style in looks_by_name([chart]).items()
+    }
+    is_plot, has_own, x = chart.kind in ("lines", "points"), chart.own_scales, chart.x[0]
+    return [
+        Panel(
+            chart,
+            styles,
+            str(name),
+            rows,
+            x,
+            y,
+            is_plot,
+            y is chart.y[0],
+            has_own == is_plot,
+            [] if is_plot else _categories(y, rows, downwards=True),
+            y if is_plot else x,
+            rows if has_own and (not is_plot or chart.across == 1) else chart.frame,
+        )
+        for y in chart.y[: None if is_plot and has_own else 1]
+        for name, rows in chart.frame.groupby(chart.panel, sort=False)
+    ]
+
+
+def _layout(panels: Sequence[Panel], is_narrow: bool) -> Layout:
+    first, parts = panels[0], sum(panel.is_first for panel in panels)
+    down = math.ceil(len(panels) / min(1 if is_narrow else first.chart.across, parts))
+    across = math.ceil(len(panels) / down)
+    width = NARROW if is_narrow or (first.is_plot and parts == 1) else WIDTH
+    is_shared = all(p.categories == first.categories for p in panels) and not (first.is_plot and first.chart.own_scales)
+    beside, share = (1, 0.46) if is_shared else (across, 0.42)
+    labels = [[_wrapped(name, share / beside * width) for name in panel.categories] for panel in panels]
+    widest = max(map(_text_width, chain(*labels)), default=0.85)
+    inner = (width - beside * widest) / across - 0.12
+    heights = _heights(panels, [*chain(*labels)])
+    ratios = [max(heights[i : i + across]) for i in range(0, len(panels), across)]
+    return Layout(panels, across, width, inner, heights, labels, is_shared, ratios)
+
+
+def _heights(panels: Sequence[Panel], labels: Sequence[str]) -> list[float]:
+    """Return the height of each panel."""
+    chart = panels[0].chart
+    is_spread = chart.kind == "dots" and not chart.join and chart.series != chart.y[0].name
+    row = max(
+        [ROW, DOT * len(panels[0].styles) * is_spread, *(LINE * (1 + text.count("\n")) + 0.015 for text in labels)]
+    )
+    return [
+        (chart.height if panel.is_plot else row * len(panel.categories) + 0.1) * (1.0 if panel.is_first else BELOW)
+        for panel in panels
+    ]
+
+
+def _draw_panel(axes: Axes, layout: Layout, place: int) -> None:
+    panel, labels = layout.panels[place], layout.labels[place][::-1]
+    chart, y = panel.chart, panel.y
+    is_left = place % layout.across == 0 or not (panel.is_plot or layout.is_shared)
+    is_lowest = place + layout.across >= len(layout.panels) or not panel.has_common_x
+    if labels:
+        axes.set_yticks(range(len(labels)), labels)
+        axes.set_ylim(-0.5, len(labels) - 0.5)
+        axes.tick_params(axis="y", length=0, labelleft=is_left)
+    DRAWN[chart.kind](axes, panel, layout.inner)
+    _draw_marks(axes, panel)
+    axes.tick_params(labelbottom=is_lowest)
+    axes.set_xlabel(_heading(panel.x, layout.inner) * is_lowest)
+    axes.set_ylabel(_heading(y, layout.heights[place]) * is_left)
+    is_only = len(panel.rows) == len(chart.frame) and chart.subtitle.startswith(panel.name)
+    name = panel.name * (not is_only and (panel.is_first or layout.across == 1))
+    note = chart.panel_notes.get(panel.name, "") if panel.is_first else y.doc
+    title = "\n".join(_wrapped(text, layout.inner) for text in (name, note) if text)
+    # values beyond the panel are written between it and its title
+    axes.set_title(title, loc="left", fontsize=SIZE, pad=4 + CUT * len(_cuts(axes)))
+
+
+# ------------------------------------------------------------------------------------- titles, legend and texts
+
+
+def _heading(column: Column, width: float) -> str:
+    """Return the heading of a column in lines; that of categories only if it is given."""
+    return _wrapped(column.heading, width) if column.label or column.kind == "number" else ""
 
 
 def _frame(figure: Figure, chart: Chart, first: Sequence[str]) -> None:
@@ -171,16 +246,16 @@ def _frame(figure: Figure, chart: Chart, first: Sequence[str]) -> None:
     look: dict[str, Any] = {"x": 0.06 / width, "ha": "left", "va": "top"}
     figure.text(y=1, s=title, fontsize=SIZE + 1, fontweight="bold", **look)
     # blank lines leave the place of the title
-    below = "\n".join([" "] * (title.count("\n") + 1) + [subtitle] * bool(subtitle))
+    below = (" \n" * (title.count("\n") + 1) + subtitle).rstrip("\n")
     figure.suptitle(below, fontsize=SIZE, color=GREY, linespacing=1.35, **look)
     drawn = {
-        name: handle for panel in figure.axes for handle, name in zip(*panel.get_legend_handles_labels(), strict=True)
+        name: handle for axes in figure.axes for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)
     }
-    names = [name for name in dict.fromkeys([*map(plain, first), *drawn]) if name in drawn]
     if drawn:
-        labels = [_wrapped(name, width - 0.6) for name in names]
+        drawn = {name: drawn[name] for name in (*first, *drawn) if name in drawn}
+        labels = [_wrapped(name, width - 0.6) for name in drawn]
         figure.legend(
-            [drawn[name] for name in names],
+            [*drawn.values()],
             labels,
             loc="outside lower center",
             ncols=_legend_columns(labels, width),
@@ -202,9 +277,9 @@ def _text_width(text: str) -> float:
     return max(map(width_in_inches, text.split("\n")))
 
 
-def _name(panel: Axes, name: str, **look: Any) -> None:
+def _name(axes: Axes, name: str, **look: Any) -> None:
     """Name a kind of mark in the legend, beside an example of it."""
-    panel.plot([], [], **{"color": GREY, "linestyle": "none", "label": plain(name)} | look)
+    axes.plot([], [], **{"color": GREY, "linestyle": "none", "label": plain(name)} | look)
 
 
 def _legend_columns(labels: Sequence[str], width: float) -> int:
@@ -225,267 +300,289 @@ def _values_text(column: Column, largest: float) -> Any:
     return axis_value if largest >= 1e5 else None
 
 
-def _is_log(column: Column, values: Any) -> bool:
-    values = np.asarray(values, dtype=float)
+def _is_log(column: Column, values: pd.Series) -> bool:
     if column.log is None:
         return is_logarithmic(values)
-    return column.log and bool((np.isfinite(values) & (values > 0)).any())
+    return column.log and bool(((values > 0) & (values < math.inf)).any())
 
 
 def _scale(
-    chart: Chart, panel: Axes, which: Literal["x", "y"], column: Column, rows: pd.DataFrame, few: bool | None = None
+    axes: Axes, which: str, column: Column, rows: pd.DataFrame, marks: Sequence[Mark] = (), ticks: Any = ()
 ) -> None:
-    """Set the scale of an axis by its values in ``rows``, with a label at each if they are ``few``; None: what is drawn.
+    """Set the scale of an axis by the values in ``rows``, with ``marks`` in view and labels at ``ticks`` where these are given.
 
-    Marks among the drawn values are in view, and the area above 1 is shaded where that means something.
+    The area above 1 is shaded where that means something.
     """
-    axis, values = getattr(panel, f"{which}axis"), rows[column.name]
-    if not pd.api.types.is_numeric_dtype(values):
-        axis.set_tick_params(rotation=30)
-        return
-    places = np.unique(values[np.isfinite(values)])
-    if _is_log(column, values) and (few is None or (places > 0).all()):
-        low, high = _log_range(column, rows, [mark.at for mark in chart.marks if mark.axis == which and few is None])
-        log_axis(
-            panel, which, low, high, places if few and column.format == "setting" else (), _values_text(column, 0.0)
-        )
+    axis, values = getattr(axes, f"{which}axis"), rows[column.name]
+    if _is_log(column, values):
+        low, high = _log_range(column, rows, [mark.at for mark in marks if mark.axis == which])
+        log_axis(axes, which, low, high, ticks if column.format == "setting" else (), _values_text(column, 0.0))
         if column.above_one and high > 1:
-            (panel.axvspan if which == "x" else panel.axhspan)(1.0, high, zorder=0, label=column.above_one, **SHADE)
-        return
-    if few:
-        axis.set_major_locator(FixedLocator(list(places)))
-    if text := _values_text(column, np.abs(places).max(initial=0.0)):
-        axis.set_major_formatter(lambda value, _: text(value))
+            shade = axes.axvspan if which == "x" else axes.axhspan
+            shade(1.0, high, zorder=0, label=column.above_one, **SHADE)
+    else:
+        if len(ticks):
+            axis.set_major_locator(FixedLocator(ticks))
+        if text := _values_text(column, values[np.isfinite(values)].abs().max()):
+            axis.set_major_formatter(lambda value, _: text(value))
 
 
-def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[float] = ()) -> tuple[float, float]:
+def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[float]) -> tuple[float, float]:
     """Return the range of a logarithmic axis: all positive values, and their intervals within a factor of 100."""
-    values = rows[column.name].clip(column.least, USELESS if column.above_one else None).to_numpy(float)
-    values = values[np.isfinite(values) & (values > 0)]
-    if not values.size:
-        return 0.1, 10.0
-    low, high = float(values.min()), float(values.max())
-    ends = rows[[name for name in (column.low, column.high) if name]].to_numpy(float).ravel()
-    ends = ends[np.isfinite(ends) & (ends >= low / 100) & (ends <= (USELESS if column.above_one else high * 100))]
+    values = rows[column.name].clip(column.least, USELESS if column.above_one else None)
+    values = values[(values > 0) & (values < math.inf)]
+    low, high = values.min(), values.max()
+    ends = rows[[name for name in (column.low, column.high) if name]].to_numpy(float)
+    ends = ends[(ends >= low / 100) & (ends <= (USELESS if column.above_one else high * 100))]
     every = [low, high, *ends, *(at for at in marks if at > 0)]
     margin = max((max(every) / min(every)) ** 0.08, 1.15)
     return min(every) / margin, max(every) * margin
 
 
-def _draw_marks(chart: Chart, panel: Axes, name: str) -> None:
+def _draw_marks(axes: Axes, panel: Panel) -> None:
     """Draw the named values and ranges of the axes; values without a name are quiet lines, not to be taken for a series."""
-    names = list(dict.fromkeys(mark.name for mark in chart.marks if mark.name and mark.to is None))
-    for mark in (mark for mark in chart.marks if mark.panel in (None, name)):
-        low, high = getattr(panel, f"get_{mark.axis}lim")()
+    marks = panel.chart.marks
+    names = dict.fromkeys(mark.name for mark in marks if mark.name and mark.to is None)
+    dashes = dict(zip(names, MARKS * len(names), strict=False))
+    for mark in marks:
+        low, high = getattr(axes, f"get_{mark.axis}lim")()
         kind = "axv" if mark.axis == "x" else "axh"
-        look: dict[str, Any] = {"label": plain(mark.name), "linewidth": 0.9, "color": "#c0c0c0"}
-        if mark.name in names:
-            look |= {"color": "#595959", "linestyle": MARKS[names.index(mark.name) % len(MARKS)]}
-        if mark.to is None and low < mark.at < high:
-            getattr(panel, f"{kind}line")(mark.at, zorder=1, **look)
-        elif mark.to is not None and (start := max(mark.at, low)) < (end := min(mark.to, high)):
-            getattr(panel, f"{kind}span")(start, end, zorder=0, label=look["label"], **BAND)
-            getattr(panel, f"set_{mark.axis}lim")(low, high)  # the range reaches the end of the axis
+        start, end = max(mark.at, low), min(mark.at if mark.to is None else mark.to, high)
+        if mark.panel not in (None, panel.name) or start > end:
+            continue
+        if mark.to is not None:
+            getattr(axes, f"{kind}span")(start, end, zorder=0, label=plain(mark.name), **BAND)
+            getattr(axes, f"set_{mark.axis}lim")(low, high)  # the range reaches the end of the axis
+        else:
+            getattr(axes, f"{kind}line")(
+                start,
+                zorder=1,
+                label=plain(mark.name),
+                linewidth=0.9,
+                color="#595959" if mark.name else "#c0c0c0",
+                linestyle=dashes.get(mark.name, "-"),
+            )
 
 
 # -------------------------------------------------------------------------------------------- lines and points
 
 
-def _draw_lines(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], y: Column, log: bool) -> None:
-    x = chart.x[0]
-    keys = [key for key in dict.fromkeys((chart.series, chart.line)) if key]
-    groups = [*part.groupby(keys, sort=False)] if keys else [(("",), part)]
-    for order, (key, points) in enumerate(groups):
-        style = styles[str(key[0]) if chart.series else ""]
-        is_line, is_number = chart.kind == "lines", pd.api.types.is_numeric_dtype(points[x.name])
-        points = points.sort_values(x.name, kind="stable") if is_line and is_number else points
-        mark = style.marker if not is_line or len(points) <= MANY or style.line == "none" else ""
+def _draw_plot(axes: Axes, panel: Panel, _: float) -> None:
+    """Draw points against x, joined by lines or arrows, and set the scales."""
+    chart, x = panel.chart, panel.x.name
+    is_numeric = pd.api.types.is_numeric_dtype(chart.frame[x])
+    groups = panel.rows.groupby([*dict.fromkeys((chart.series, chart.line))], sort=False)
+    for order, ((series, *_), rows) in enumerate(groups):
+        if is_numeric:
+            rows = rows.sort_values(x, kind="stable")
+        style = panel.styles[str(series)]
+        if len(rows) > MANY and style.line != "none":
+            style = replace(style, marker="")
         # marks on top of each other are all seen
-        shift = BESIDE * (order - (len(groups) - 1) / 2) * (is_line and not (chart.line or chart.band) and mark != "")
-        _draw_values(chart, panel, points, y, log, points[x.name].to_numpy(), style, mark, shift)
+        is_aside = chart.kind == "lines" and not (chart.line or chart.band) and style.marker != ""
+        shift = BESIDE * (order - (len(groups) - 1) / 2) * is_aside
+        _draw_series(Series(axes, panel, style, rows[x].to_numpy(), shift), rows)
+    if is_numeric:
+        rows = chart.frame if chart.own_scales else panel.rows
+        is_few = chart.frame.groupby(chart.panel)[x].nunique().max() <= 6
+        _scale(axes, "x", panel.x, rows, ticks=np.unique(rows[x].dropna()) if is_few else ())
+    else:
+        axes.tick_params("x", rotation=30)
+    _scale(axes, "y", panel.y, panel.scaled, chart.marks)
+    if not panel.is_first:
+        axes.margins(y=0.4)
+    elif chart.arrow:
+        _draw_arrows(axes, panel)
 
 
-def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style]) -> None:
+def _draw_arrows(axes: Axes, panel: Panel) -> None:
     """Join the points of each arrow that has two, where they are apart."""
-    x, y = chart.x[0], chart.y[0]
-    for _, points in part.groupby(chart.arrow, sort=False):
-        ends = np.array([points[x.name], points[y.name].clip(y.least, USELESS)], dtype=float).T
-        if np.ptp(panel.transData.transform(ends), axis=0).max() > NEAR:
-            colour = styles[str(points[chart.series].iloc[0])].colour
-            panel.annotate(
-                "", ends[-1], ends[0], arrowprops={"arrowstyle": "-|>", "color": colour, "linewidth": 1.6}, zorder=2
-            )
-            _name(panel, chart.arrow_name, marker="$\u2192$", markersize=10)
+    chart, y = panel.chart, panel.y
+    for _, rows in panel.rows.groupby(chart.arrow, sort=False):
+        ends = np.array([rows[panel.x.name], rows[y.name].clip(y.least, USELESS)], dtype=float).T
+        if np.ptp(axes.transData.transform(ends), axis=0).max() > NEAR:
+            colour = panel.styles[str(rows[chart.series].iloc[0])].colour
+            look = {"arrowstyle": "-|>", "color": colour, "linewidth": 1.6}
+            axes.annotate("", ends[-1], ends[0], arrowprops=look, zorder=2)
+            _name(axes, chart.arrow_name, marker="$\u2192$", markersize=10)
 
 
-def _draw_values(
-    chart: Chart,
-    panel: Axes,
-    points: pd.DataFrame,
-    column: Column,
-    log: bool,
-    places: np.ndarray,
-    style: Style,
-    marker: str,
-    shift: float = 0.0,
-) -> None:
-    """Draw the values of a column at ``places`` of the other axis, with intervals, ``shift`` points to the right.
+# ------------------------------------------------------------------------------------------ values of a series
+
+
+@dataclass(frozen=True)
+class Series:
+    """Points of one look in a panel, at ``places`` of the axis across their values, drawn ``shift`` points to the right."""
+
+    axes: Axes
+    panel: Panel
+    style: Style
+    places: np.ndarray
+    shift: float = 0.0
+
+    def plot(self, which: Any, values: Any, **look: Any) -> None:
+        """Draw some of the points at ``values``."""
+        pair = (self.places[which], values)[:: 1 if self.panel.is_plot else -1]
+        (line,) = self.axes.plot(*pair, color=self.style.colour, zorder=3, **{"linestyle": "none"} | look)
+        self.move(line)
+
+    def move(self, drawn: Any) -> None:
+        """Shift what was drawn."""
+        drawn.set_transform(offset_copy(drawn.get_transform(), drawn.figure, self.shift, units="points"))
+
+
+def _draw_series(series: Series, rows: pd.DataFrame) -> None:
+    """Draw the measured values of rows with intervals.
 
     Limits are hollow, failures crosses at the edge, and so are arrows to values beyond it, to which lines lead.
     """
-    values = points[column.name].to_numpy(float)
-    limit, lost = (
-        points[name].to_numpy(bool) if name else np.zeros(len(points), bool) for name in (column.limit, chart.failed)
-    )
-    most = USELESS if log and column.above_one else math.inf
-    given, is_cut = values, values > most
-    if log:  # what has no logarithm is an upper limit too, at the least value that has one
-        every = chart.frame[column.name]
-        limit = (limit | (values <= column.least)) & ~lost
-        values = values.clip(column.least or every[every > 0].min())
-    is_flat = chart.kind == "dots"
-    aside = ScaledTranslation(shift / 72, 0.0, panel.figure.dpi_scale_trans)
-    edge = panel.get_yaxis_transform() if is_flat else panel.get_xaxis_transform()
-    look: dict[str, Any] = {"color": style.colour, "zorder": 3}
-
-    def plot(at: Any, value: Any, **more: Any) -> None:
-        (line,) = panel.plot(*((value, at) if is_flat else (at, value)), **look | more)
-        line.set_transform(line.get_transform() + aside)
-
-    is_hollow, size = limit & bool(marker), 2.55 + 1.5 * style.width
-    plot(
-        places,
-        np.where(is_hollow | lost, math.nan, values),  # dots lead to a limit
-        marker=marker,
-        markevery=~is_cut,
-        linestyle=style.line if chart.kind == "lines" else "none",
+    column, chart, style = series.panel.value, series.panel.chart, series.style
+    given = values = rows[column.name].to_numpy(float)
+    is_failed, is_limit = (rows[name].to_numpy(bool) for name in (chart.failed, column.limit))
+    low, high = (pd.to_numeric(rows[end], errors="coerce").to_numpy() for end in (column.low, column.high))
+    most = math.inf
+    if _is_log(column, series.panel.scaled[column.name]):
+        every = chart.frame[column.name]  # what has no logarithm is an upper limit too, at the least value that has one
+        values = given.clip(column.least or every[every > 0].min())
+        is_limit = is_limit | (given <= column.least)
+        low, high = np.maximum(low, SMALLEST), np.minimum(high, LARGEST)
+        most = USELESS if column.above_one else most
+    is_limit = is_limit & ~is_failed
+    is_hollow, size = is_limit & bool(style.marker), 2.55 + 1.5 * style.width
+    series.plot(
+        slice(None),
+        np.where(is_hollow | is_failed, math.nan, values),  # dots lead to a limit
+        marker=style.marker,
+        markevery=~(given > most),
+        linestyle=style.line,
         linewidth=style.width,
         markersize=size,
         drawstyle="steps-post" if chart.steps else "default",
         label=plain(style.meaning),
     )
     if is_hollow.any():
-        shown, leads = np.where(lost, math.nan, values), ":" if chart.kind == "lines" else "none"
-        plot(places, shown, marker=marker, markevery=limit, linestyle=leads, linewidth=0.8, markersize=size, **HOLLOW)
-        _name(panel, "upper limit", marker="o", **HOLLOW)
-    if column.low and column.high:
-        low, high = (points[end].to_numpy(float) for end in (column.low, column.high))
-        if log:
-            low, high = np.maximum(low, SMALLEST), np.minimum(high, LARGEST)
-        known = np.isfinite(low + high) & ~limit
-        if known.any():
-            mark = "s" if chart.band else "_" if is_flat else "|"
-            key, alpha = GREY if chart.series else style.colour, 0.3 if chart.band else 1.0
-            _name(panel, column.ends, marker=mark, markersize=9, color=key, alpha=alpha)
-        if chart.band:
-            panel.fill_between(places, low, high, known, color=style.colour, alpha=0.18, linewidth=0, zorder=2)
-        else:
-            bars = panel.hlines if is_flat else panel.vlines
-            ends = bars(places[known], low[known], high[known], linewidth=1.0, **look)
-            ends.set_transform(ends.get_transform() + aside)
-    if is_cut.any():  # numbers are beside the panel, above those that were cut before
-        arrow: dict[str, Any] = {"marker": f"${'→' if is_flat else '↑'}$", "markersize": 7}
-        _name(panel, "beyond the axis, the largest as a number", **arrow)
-        plot(places[is_cut], np.full(is_cut.sum(), 0.96), linestyle="none", transform=edge, **arrow)
-        last = int(np.nanargmax(np.where(is_cut, given, np.nan)))
-        cuts = [text.get_text().split()[-1] for text in panel.texts if text.get_gid() == "cut"]
-        label = number(given[last])
-        at, above = ((1, places[last]), (2, -3)) if is_flat else ((places[last], 1), (0, 2 + CUT * len(cuts)))
+        shown, leads = np.where(is_failed, math.nan, values), ":" if chart.kind == "lines" else "none"
+        look = {"marker": style.marker, "markersize": size, "linestyle": leads, "linewidth": 0.8} | HOLLOW
+        series.plot(slice(None), shown, markevery=is_limit, **look)
+        _name(series.axes, "upper limit", marker="o", **HOLLOW)
+    _draw_intervals(series, low, high, np.isfinite(low + high) & ~is_limit)
+    _draw_at_edge(series, given, given > most, is_failed)
+
+
+def _draw_intervals(series: Series, low: np.ndarray, high: np.ndarray, is_known: np.ndarray) -> None:
+    """Draw the intervals that are known as bars, or as a band."""
+    axes, panel, places, colour = series.axes, series.panel, series.places, series.style.colour
+    if not is_known.any():
+        return
+    bars, mark = (axes.vlines, "|") if panel.is_plot else (axes.hlines, "_")
+    mark, alpha = ("s", 0.3) if panel.chart.band else (mark, 1.0)
+    key = GREY if panel.chart.series else colour
+    _name(axes, panel.value.ends, marker=mark, markersize=9, color=key, alpha=alpha)
+    if panel.chart.band:
+        axes.fill_between(places, low, high, is_known, color=colour, alpha=0.18, linewidth=0, zorder=2)
+    else:
+        series.move(bars(places[is_known], low[is_known], high[is_known], linewidth=1.0, color=colour, zorder=3))
+
+
+def _draw_at_edge(series: Series, given: np.ndarray, is_beyond: np.ndarray, is_failed: np.ndarray) -> None:
+    """Draw arrows to values beyond the axis, with the largest beside the panel, and crosses for failures, at the lower edge for 0."""
+    axes, is_plot = series.axes, series.panel.is_plot
+    edge = axes.get_xaxis_transform() if is_plot else axes.get_yaxis_transform()
+    if is_beyond.any():
+        mark, cuts = "$↑$" if is_plot else "$→$", _cuts(axes)
+        _name(axes, "beyond the axis, the largest as a number", marker=mark, markersize=7)
+        series.plot(is_beyond, [0.96] * is_beyond.sum(), transform=edge, marker=mark, markersize=7)
+        largest = np.argmax(np.where(is_beyond, given, 0.0))
+        label, at = number(given[largest]), series.places[largest]
         if label not in cuts:
-            panel.annotate(
-                f"{SIGNS.get(marker, '')} {label}",
-                at,
-                above,
+            axes.annotate(
+                f"{SIGNS.get(series.style.marker, '')} {label}",
+                (at, 1) if is_plot else (1, at),
+                (0, 2 + CUT * len(cuts)) if is_plot else (2, -3),  # above those that are there
                 xycoords=edge,
                 textcoords="offset points",
-                color=style.colour,
+                color=series.style.colour,
                 gid="cut",
-                ha="left" if is_flat else "center",
+                ha="center" if is_plot else "left",
                 annotation_clip=False,
             )
-    if lost.any():
-        _name(panel, chart.failed_name, marker="x")
-        plot(
-            places[lost],
-            (given[lost] != 0) * (1.0 if is_flat else 0.97),
-            marker="x",
-            linestyle="none",
-            transform=edge,
-            markersize=5,
-            markeredgewidth=1.4,
-            clip_on=False,
-        )
+    if is_failed.any():
+        _name(axes, series.panel.chart.failed_name, marker="x")
+        at = (given[is_failed] != 0) * (0.97 if is_plot else 1.0)
+        series.plot(is_failed, at, transform=edge, markersize=5, markeredgewidth=1.4, marker="x", clip_on=False)
+
+
+def _cuts(axes: Axes) -> list[str]:
+    """Return the numbers that stand beside a panel, since they are beyond its axis."""
+    return [text.get_text().split()[-1] for text in axes.texts if text.get_gid() == "cut"]
 
 
 # ----------------------------------------------------------------------------------------------- dots and grids
 
 
-def _draw_dots(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], place: dict[str, int]) -> None:
+def _draw_dots(axes: Axes, panel: Panel, _: float) -> None:
     """Draw a row per category, with a dot and an interval per series."""
-    x, y = chart.x[0], chart.y[0]
-    values = part if chart.own_scales else chart.frame
-    log = _is_log(x, values[x.name])
-    if chart.join:
-        for category, points in part.groupby(part[y.name].astype(str), sort=False):
-            ends = points[x.name].clip(x.least)
-            ground = styles[str(points[chart.series].iloc[-1])].colour
-            panel.hlines(place[str(category)], ends.min(), ends.max(), ground, zorder=1, alpha=0.45, linewidth=1.8)
-    is_spread = not chart.join and part[y.name].nunique() < len(part)
-    for order, (series, style) in enumerate(styles.items()):
-        points = part[part[chart.series].astype(str) == series] if chart.series else part
-        shift = -0.75 * (order - (len(styles) - 1) / 2) / max(len(styles), 2) if is_spread else 0.0
-        rows = np.array([place[str(v)] for v in points[y.name]]) + shift
-        _draw_values(chart, panel, points, x, log, rows, style, style.marker or "o")
-    panel.grid(axis="y", color="#e4e4e4", linewidth=0.6)
-    panel.set_axisbelow(True)
-    panel.set_xlabel(plain(x.heading))
-    _scale(chart, panel, "x", x, values)
+    chart, styles, x = panel.chart, panel.styles, panel.x
+    for _, rows in panel.rows.groupby(panel.y.name, sort=False) if chart.join else ():
+        ends, colour = rows[x.name].clip(x.least), styles[str(rows[chart.series].iloc[-1])].colour
+        axes.hlines(panel.heights(rows)[0], ends.min(), ends.max(), colour, zorder=1, alpha=0.45, linewidth=1.8)
+    is_spread = not chart.join and panel.rows[panel.y.name].nunique() < len(panel.rows)
+    for order, (name, style) in enumerate(styles.items()):
+        rows = panel.rows[panel.rows[chart.series].astype(str) == name]
+        above = 0.75 * ((len(styles) - 1) / 2 - order) / max(len(styles), 2) * is_spread
+        _draw_series(Series(axes, panel, replace(style, marker=style.marker or "o"), panel.heights(rows) + above), rows)
+    axes.grid(axis="y", color="#e4e4e4", linewidth=0.6)
+    axes.set_axisbelow(True)
+    _scale(axes, "x", x, panel.scaled, chart.marks)
 
 
-def _draw_grid(
-    chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], place: dict[str, int], width: float
-) -> None:
+def _draw_grid(axes: Axes, panel: Panel, width: float) -> None:
     """Draw a cell per pair of x and y, coloured by level, in ``width`` inches."""
-    x, y = chart.x[0], chart.y[0]
-    names = _categories(x, part if chart.own_scales else chart.frame)
-    room = width / max(len(names), 1)
-    widest = max(map(width_in_inches, map(str, chart.frame[chart.cell])), default=0.0) if chart.cell else 0.0
-    has_text = chart.cell and min(0.8 * 72 * room, SIZE * 0.92 * room / max(widest, 0.1)) >= SIZE - 1
-    for line in part.to_dict("records"):
-        at = names.index(value_text(line[x.name])), place[value_text(line[y.name])]
-        face, name = styles[str(line[chart.level])].colour, plain(styles[str(line[chart.level])].meaning)
-        panel.add_patch(
-            Rectangle((at[0] - 0.5, at[1] - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=0.8, label=name)
-        )
-        if has_text:  # smaller ones would not be readable
+    chart, x, rows = panel.chart, panel.x, panel.rows
+    names = _categories(x, chart.frame)
+    room = width / len(names)
+    widest = max(map(width_in_inches, map(str, chart.frame[chart.cell])))
+    has_text = room >= 0.95 * max(widest, 0.128)  # smaller ones would not be readable
+    for line, height in zip(rows.to_dict("records"), panel.heights(rows), strict=True):
+        style, place = panel.styles[str(line[chart.level])], names.index(value_text(line[x.name]))
+        name, corner = plain(style.meaning), (place - 0.5, height - 0.5)
+        axes.add_patch(Rectangle(corner, 1, 1, facecolor=style.colour, edgecolor="white", linewidth=0.8, label=name))
+        if has_text:
             text = plain(str(line[chart.cell]))
-            panel.text(*at, text, ha="center", va="center", color=ink_on(face), fontsize=SIZE - 1)
-    if len(part[[x.name, y.name]].drop_duplicates()) < len(names) * len(place):
-        _name(panel, f"blank: {chart.failed_name}", marker="s", **HOLLOW)
-    ends = part.groupby(x.name)[chart.limit].first() if chart.limit else pd.Series(dtype=float)
-    levels = part[y.name].drop_duplicates()
-    steps = [(levels <= end).sum() - 0.5 if 0 < end < math.inf else math.nan for end in ends]
-    if np.isfinite(steps).any():  # along the edges of cells, since it crosses no number there
-        panel.stairs(steps, np.arange(len(steps) + 1) - 0.5, baseline=None, label=chart.limit_name, **LIMIT)
-    panel.set_xlim(-0.5, len(names) - 0.5)
+            axes.text(place, height, text, ha="center", va="center", color=ink_on(style.colour), fontsize=SIZE - 1)
+    if len(rows.drop_duplicates([x.name, panel.y.name])) < len(names) * len(panel.categories):
+        _name(axes, f"blank: {chart.failed_name}", marker="s", **HOLLOW)
+    if chart.limit:  # along the edges of cells, since it crosses no number there
+        levels, ends = rows[panel.y.name].drop_duplicates(), rows.groupby(x.name)[chart.limit].first()
+        steps = [(levels <= end).sum() - 0.5 if 0 < end < math.inf else math.nan for end in ends]
+        if np.isfinite(steps).any():
+            axes.stairs(steps, np.arange(len(steps) + 1) - 0.5, baseline=None, label=chart.limit_name, **LIMIT)
+    axes.set_xlim(-0.5, len(names) - 0.5)
+    _name_columns(axes, x, names, room)
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+
+
+def _name_columns(axes: Axes, x: Column, names: Sequence[str], room: float) -> None:
+    """Write the names of columns ``room`` inches wide: of numbers that would overlap each second or more, long words upwards."""
     labels, step, angle = [_wrapped(name, room - 0.06, r"_,\[ =") for name in names], 1, 0
     widest = max(map(_text_width, labels))
-    if x.kind == "number":  # of numbers that would overlap, each second or more is shown
+    if x.kind == "number":
         step = math.ceil((widest + 0.08) / room)
     elif widest > room:
         angle = 90
         every = ([_wrapped(name, length) for name in names] for length in UPWARDS)
         labels = next((each for each in every if max(label.count("\n") + 1 for label in each) * LINE <= room), labels)
-    panel.set_xticks(range(0, len(names), step), labels[::step], rotation=angle)
-    panel.set_xlabel(plain(x.heading) if x.label or x.kind == "number" else "")
-    panel.tick_params(length=0)
-    for spine in panel.spines.values():
-        spine.set_visible(False)
+    axes.set_xticks(range(0, len(names), step), labels[::step], rotation=angle)
+
+
+DRAWN = {"lines": _draw_plot, "points": _draw_plot, "dots": _draw_dots, "grid": _draw_grid}
+"""What draws the inside of a panel, by kind of chart."""
 
 
 def _categories(column: Column, rows: pd.DataFrame, downwards: bool = False) -> list[str]:
     """Return the categories of an axis in order: strings as they appear, numbers increasing, or downwards decreasing."""
-    values = rows[column.name].drop_duplicates()
+    values = rows[column.name]
     if pd.api.types.is_numeric_dtype(values):
         values = values.dropna().sort_values(ascending=not downwards)
     return list(dict.fromkeys(map(value_text, values)))
@@ -493,5 +590,4 @@ def _categories(column: Column, rows: pd.DataFrame, downwards: bool = False) -> 
 
 def ink_on(ground: str) -> str:
     """Return black or white, whichever contrasts more with a colour."""
-    r, g, b = to_rgb(ground)
-    return "#000000" if 0.3 * r + 0.59 * g + 0.11 * b > 0.5 else "#ffffff"
+    return "#000000" if np.dot(to_rgb(ground), (0.3, 0.59, 0.11)) > 0.5 else "#ffffff"

@@ -42,7 +42,7 @@ def log_axis(
     Ticks are at the values ``wanted`` if the axis spans at most three decades and they are not too close, else at round
     values. ``text`` formats the labels.
     """
-    axis = panel.xaxis if which == "x" else panel.yaxis
+    axis = getattr(panel, f"{which}axis")
     low, high = max(low, SMALLEST), min(high, LARGEST)
     getattr(panel, f"set_{which}scale")("log")
     getattr(panel, f"set_{which}lim")(low, high)
