@@ -25,11 +25,12 @@ def command() -> None:
     channel = os.environ.pop(CHANNEL, "")
     if not channel:
         os._exit(_watched())  # without waiting for threads
-    gc.set_threshold(20_000)  # imports and tables make many objects that stay
     from bench.cli import main
     from bench.errors import failure
     from bench.host import guard
     from bench.model import registry
+
+    gc.freeze()  # what imports have made stays
 
     descriptor, parent = map(int, channel.split())
     os.set_inheritable(descriptor, False)

@@ -41,8 +41,8 @@ DIFFERENCED, SAME = 4, 1e-3
 """Most components at which differences are compared with a wrong gradient, and the largest part of its error that is left."""
 DIFFERENCE_STEPS = 10.0 ** -np.arange(1.0, 9.0)
 """Steps of these differences, in units of max(1, |x|)."""
-BESIDE, MOST_ROWS = 1e-5, 64
-"""Spacing of the thetas at which the noise of a gradient is measured, in units of each input's scale, and most numbers of it."""
+BESIDE, MOST_ROWS = (1e-5, 1e-4, 1e-3), 64
+"""Spacings of the thetas at which the noise of a gradient is measured, in units of each input's scale, and most numbers of it."""
 LOOSE, MOST_OF_IT, REFINED = 0.01, 0.6, 10.0
 """Relative error of a difference that shows too little, largest share of the remaining calls for a component's smooth part,
 and step of a refined cost's differences, in multiples of the cube root of the unit roundoff: it has a tolerance too."""
@@ -179,11 +179,14 @@ def smooth_parts(stages: GradientStages, outcome: Check) -> dict[str, SmoothPart
 
 @np.errstate(all="ignore")
 def noise_of_gradient(stages: GradientStages) -> float:
-    """Return the noise of the gradient at equally spaced thetas along a random direction, relative to its norm."""
+    """Return the noise of the gradient at thetas along a random direction, at the least spacing at which it always changes, relative to its norm."""
     random = np.random.default_rng([stages.seed, 0x6E6F6973])
-    along = BESIDE * stages.scale * random.standard_normal(stages.theta.size)
-    thetas = stages.theta[:, None] + along[:, None] * np.arange(roughness.POINTS)
-    gradients = stages.gradients(thetas)[:MOST_ROWS]
+    along = stages.scale * random.standard_normal(stages.theta.size)
+    for spacing in BESIDE:
+        thetas = stages.theta[:, None] + spacing * along[:, None] * np.arange(roughness.POINTS)
+        gradients = stages.gradients(thetas)[:MOST_ROWS]
+        if np.diff(gradients).any(axis=0).all():
+            break
     noise = [roughness.noise(row[None]) for row in gradients]
     return float(np.linalg.norm(noise) / np.linalg.norm(gradients[:, 0]))
 
@@ -259,7 +262,8 @@ def is_adaptive(
     lines = [*lines, line]
     slope = max(_slope_of_breaks(one, stages.scale) for one in lines)
     is_bounded = size > EXPLAINED_IF_SMALL * slope and sum(len(one.breaks) for one in lines) >= FEWEST_BREAKS
-    return size <= EXPLAINED * slope or (relative_error(outcome) <= NEAR and not is_bounded)
+    is_small = all(p.error <= NEAR for p in outcome.components if p.verdict in SUSPICIOUS)
+    return size <= EXPLAINED * slope or (relative_error(outcome) <= NEAR and is_small and not is_bounded)
 
 
 def _error_vector(stages: GradientStages, outcome: Check) -> np.ndarray:

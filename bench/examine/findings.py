@@ -47,6 +47,8 @@ DEVIATIONS = 4.0
 """Standard deviations of the slope along a random direction that errors within the tolerance do not exceed."""
 SEEN_ALONE = 4.0
 """Multiple of a slope's error from which the error of one number shows along most random directions."""
+NOISES = 4.0
+"""Largest error of a derivative that noise of the gradient explains, in multiples of that noise."""
 AGREES = 0.5
 """Largest distance of a gradient that agrees with a refined cost, relative to that of the cost's own differences."""
 AS_FAR = 4.0
@@ -427,7 +429,8 @@ class Findings:
         is_noisy = repeats.spread > repeats.floor and not repeats.has_state
         yield "nondeterministic", repeats.is_large and not is_noisy, self.spread_text
         known = f"{self.spread_text}; {counted(len(self.resolved_parts), 'slope')} known to 10%"
-        is_noisy &= repeats.of_gradient > repeats.floor_of_gradient or self.settled.cause not in UNEQUAL
+        wrong = max((part.error for part in self.settled.parts if part.verdict in FAULTS), default=math.inf)
+        is_noisy &= self.settled.cause not in FAULTS or wrong <= NOISES * repeats.of_gradient
         yield "noisy", is_noisy, known
         if self.wrong_checks:
             yield from self._verdicts_on_failed(self.wrong_checks[0].cause)
@@ -758,6 +761,8 @@ class Findings:
         """Whether the cause is the expected one, and no wrong gradient."""
         is_open = RULES[self.cause].kind in ("open", "broken") or self.derivative in (RIGHT, NONE)
         is_open &= not (self.cause == "unresolved" and self.wrong_checks)
+        is_known = self.resolved_parts and self.repeats.of_gradient <= DIGIT
+        is_open &= self.cause != "noisy" or bool(is_known)
         # with sigma, the bias that jumps on a line make is measured and has a cause of its own
         is_of_jumps = self.cause == "biased" and self.missed > TARGET_ERROR
         return self.expect in (self.cause, "jumps" if is_of_jumps else self.cause) and is_open

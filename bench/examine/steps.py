@@ -56,9 +56,10 @@ def rounds_of_loops(simulator: Simulator, theta: np.ndarray, w: np.ndarray | Non
         while running and running[-1][0] is not caller:
             running.pop()
         if caller is not None:
-            # one call of compiled code, in no loop of its file, enters Python functions again and again
+            # one call of a package's compiled code, in no loop of its file, enters Python functions again and again
             site, line, outer = (caller, caller.f_lasti), caller.f_lineno, caller.f_code.co_filename
-            if site in running[-1:] and not any(loop.lineno <= line <= loop.end_lineno for loop in _loops(outer)):
+            is_loop = any(loop.lineno <= line <= loop.end_lineno for loop in _loops(outer)) or _is_skipped(outer)
+            if site in running[-1:] and "site-packages" in outer and not is_loop:
                 rounds[outer, line] += 1
             running[-1:] = [site]
         running.append((frame, -1))
@@ -75,10 +76,14 @@ def rounds_of_loops(simulator: Simulator, theta: np.ndarray, w: np.ndarray | Non
     return rounds if np.isfinite(costs).all() else Counter()
 
 
+def _is_skipped(file: str) -> bool:
+    return any(folder in file for folder in SKIPPED)
+
+
 @cache
 def _loops(file: str) -> list[Any]:
     """Return the loops of a file of the program."""
-    if any(folder in file for folder in SKIPPED):
+    if _is_skipped(file):
         return []
     try:
         nodes = ast.walk(ast.parse("".join(linecache.getlines(file))))

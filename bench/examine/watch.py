@@ -20,7 +20,7 @@ from bench.errors import UserError, failure, needing_sweeps
 from bench.examine.few import ROUNDED, ROUNDS, FewSteps
 from bench.examine.lines import scan
 from bench.examine.subspace import Group, Subspace
-from bench.gradient import FAULTS, RULES
+from bench.gradient import FAULTS, RULES, TRUSTED
 from bench.measure.statistics import ends
 from bench.simulator.simulator import Simulator
 from bench.simulator.tree import ParameterTree, numbers
@@ -155,14 +155,16 @@ class Watch:
     @property
     def first(self) -> tuple[int, str] | None:
         """The first noted iteration at which the gradient was of no use, and the reason; None if there is none."""
-        cosines: list[float] = []
+        checked: list[dict[str, Any]] = []
         largest = 0.0
         for k, row in enumerate(self.rows):
-            cosines += [row["cosine_high"]] * bool(row["verdict"])
+            checked += [row] * bool(row["verdict"])
+            last = checked[-EARLIER:] if len(checked) >= EARLIER else []
+            is_lasting = bool(last) and all(one["verdict"] in FAULTS for one in last)
             reasons = {
-                row["verdict"]: row["verdict"] in FAULTS and not row["error"] <= USABLE,
+                row["verdict"]: row["verdict"] in FAULTS and (is_lasting or not row["error"] <= USABLE),
                 "not_finite": not (row["reason"] or math.isfinite(row["gradient_norm"])),
-                "opposed": sum(cosine < 0.0 for cosine in cosines[-EARLIER:]) == EARLIER,
+                "opposed": bool(last) and all(one["cosine_high"] < 0.0 for one in last),
                 "explodes": k >= EARLIER and row["gradient_norm"] > LARGER * largest,
             }
             for reason in filter(reasons.get, reasons):
@@ -178,7 +180,7 @@ class Watch:
             text += f", {len(reasons)} with errors: {reasons[0]}"
         text += self._unwritten
         if self.first is None:
-            return f"{text}: {f'no fault above {USABLE:.0%}' if verdicts else 'nothing is known of the gradient'}"
+            return f"{text}: {f'no fault above {USABLE:.0%}' if verdicts.keys() & TRUSTED else 'nothing is known of the gradient'}"
         iteration, code = self.first
         meaning = RULES[code].meaning if code in RULES else MEANINGS[code]
         return f"{text}: of no use from iteration {iteration} on ({code}: {meaning})"

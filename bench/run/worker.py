@@ -54,7 +54,7 @@ def main() -> None:
     # Ctrl-C reaches the run, which ends its workers
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     faulthandler.enable(all_threads=False)
-    gc.set_threshold(20_000)
+    gc.freeze()  # what imports have made stays
     sys.argv[:] = ["bench-worker"]
     with suppress(ConnectionLost):
         _serve(Connection(descriptor))

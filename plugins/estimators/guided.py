@@ -27,10 +27,13 @@ class Guided(Estimator):
     subspace: int = param(4, "samples whose gradients span the subspace", positive=True)
     share: float = param(0.1, "share of the gradient outside the subspace in the expectation", low=0.0, high=1.0)
 
+    @property
+    def least_samples(self) -> int:  # type: ignore[override]
+        """One more than span the subspace."""
+        return self.subspace + 1
+
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return the mean of the differences along guided directions, ``(R, d)``; ValueError for too few samples."""
-        if noise.shape[1] <= self.subspace:
-            raise ValueError(f"{self.name} needs more than {self.subspace} samples, got {noise.shape[1]}")
+        """Return the mean of the differences along guided directions, ``(R, d)``."""
         first, rest = noise[:, : self.subspace], noise[:, self.subspace :]
         gradients = first_order(problem, theta, first)
         _, sizes, basis = np.linalg.svd(gradients, full_matrices=False)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Estimator, Problem, Program, best_gradient, first_order, param
+from bench.model import Estimator, Problem, Program, Unsupported, best_gradient, first_order, param
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,11 @@ class Planted(Estimator):
         return None
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return the gradients with their errors, ``(R, d)``; ValueError if too few samples remain for the base."""
+        """Return the gradients with their errors, ``(R, d)``; Unsupported if too few samples remain for the base."""
         spare = self._spare(problem.program) if self.noise else 0
         is_exact = self.base == "best" and problem.program.continuous
         if noise.shape[1] < spare + (not is_exact):
-            raise ValueError(f"the planted noise needs {spare + 1} samples, got {noise.shape[1]}")
+            raise Unsupported(f"the planted noise needs {spare + 1} samples, got {noise.shape[1]}")
         own, used = noise[:, : noise.shape[1] - spare], noise[:, noise.shape[1] - spare :]
         g = self._base(problem, theta, own)
         norm = np.linalg.norm(g, axis=1, keepdims=True)

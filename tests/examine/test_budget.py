@@ -57,6 +57,22 @@ def test_with_the_proposed_calls_nothing_is_left_out(size, settings):
         assert not examined(int(proposed)).left_out
 
 
+@pytest.mark.parametrize(("budget", "size"), [(1, 2), (20, 100)])
+def test_the_proposed_budget_suffices_for_a_slow_cost(now, budget, size):
+    def slow(x):
+        now[0] += 20.0
+        return float(x @ x)
+
+    def gradient(x):
+        now[0] += 60.0
+        return 2 * x
+
+    report = examine(slow, np.ones(size), grad=gradient, budget=budget)
+    assert report.cause == "undecided"
+    (proposed,) = re.findall(r"budget=(\d+)s", report.advice)
+    assert examine(slow, np.ones(size), grad=gradient, budget=float(proposed)).derivative == "right"
+
+
 @pytest.mark.parametrize("factor", [1.0, 1.002])
 def test_verdicts_do_not_depend_on_load(now, factor):
     """A cost that is four times slower, as on a loaded machine, gets the same verdict."""

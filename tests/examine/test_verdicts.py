@@ -40,6 +40,25 @@ def noisy(x):
     return swing(x) + 1e-7 * RANDOM.standard_normal()
 
 
+def pressed(x):
+    """A ball on points: compiled code calls a function for each contact."""
+    touched = [x[0] - point for point in np.linspace(-1.0, 1.0, 41) if point < x[0]]
+    return sum(map(lambda depth: depth**3, touched)) + 0.02 * x[0] * x[1] + 0.5 * np.sin(x[1])
+
+
+def without_friction(x):
+    depths = np.maximum(x[0] - np.linspace(-1.0, 1.0, 41), 0.0)
+    return np.array([3.0 * (depths**2).sum() + 0.02 * x[1], 0.5 * np.cos(x[1])])
+
+
+def coupled(x):
+    """A loop of Newton's method, whose length depends on theta."""
+    z = 1.0
+    while abs(z**3 + 1.3 * z - x[0]) > 1e-13:
+        z -= (z**3 + 1.3 * z - x[0]) / (3.0 * z * z + 1.3)
+    return (10.0 + 0.2 * x[1]) * z + 0.3 * np.sin(x[1]), (10.0 + 0.2 * x[1]) / (3.0 * z * z + 1.3)
+
+
 def root(x, xtol=1e-3):
     return brentq(lambda z: z**3 + x[0] * z - x[1], -5.0, 5.0, xtol=xtol)
 
@@ -206,6 +225,22 @@ CASES = {
     "noise of the cost": (3, "noisy", noisy, slope, {}),
     "expected noise of the cost": (0, "noisy", noisy, slope, {"expect": "noisy"}),
     "noise of the gradient too": (3, "noisy", noisy, lambda x: slope(x) * RANDOM.normal(1.0, 1e-3), {}),
+    "a wrong sign beside that noise": (
+        1,
+        "",
+        noisy,
+        lambda x: slope(x) * RANDOM.normal(-1.0, 1e-3),
+        {"expect": "noisy"},
+    ),
+    "a random gradient is not expected": (3, "noisy", noisy, lambda x: RANDOM.standard_normal(2), {"expect": "noisy"}),
+    "a loop in map": (1, "missing_term", pressed, without_friction, {"theta": [0.31, 0.4]}),
+    "a term beside a solver's loop": (
+        1,
+        "missing_term",
+        lambda x: coupled(x)[0],
+        lambda x: np.array([coupled(x)[1], 0.3 * np.cos(x[1])]),
+        {"theta": [0.9, 0.4]},
+    ),
     "noise of the gradient alone": (1, "nondeterministic", swing, lambda x: slope(x) * RANDOM.normal(1.0, 0.1), {}),
     "a root to a thousandth": (3, "adaptive", root, root_slope, {"theta": [1.3, 0.9]}),
     "a third too much of a root to a millionth": (
@@ -258,6 +293,7 @@ CASES = {
         {"theta": POINT, "calls": 1500},
     ),
     "what a solver leaves of a derivative of 0": (3, "unresolved", residue(1e-6), by_size(8e-8), {}),
+    "the same is not expected away": (3, "unresolved", residue(1e-6), by_size(8e-8), {"expect": "unresolved"}),
     "a small slope with the wrong sign": (1, "", residue(1e-6), by_size(1e-6), {}),
     "a small slope beside an undefined one": (
         1,

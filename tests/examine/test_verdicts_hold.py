@@ -100,6 +100,14 @@ def test_the_right_gradient_of_the_same_program_passes_with_every_hint():
         assert report.derivative == "right", f"{name}\n{report}"
 
 
+def test_stairs_say_nothing_about_noise_that_was_not_measured():
+    table = np.sin(np.linspace(0.0, 2.0, 41))
+    said = bench.examine(
+        lambda x: table[round(float(x[0]) / 0.05)], [0.777], grad=lambda x: [np.cos(x[0])], sigma=0.1, calls=700
+    )
+    assert said.use == "not measured", said
+
+
 def test_a_check_that_is_not_finished_names_no_error_after_other_steps():
     grad = partial(swinging, slope=True)
     unfinished = dataclasses.replace(

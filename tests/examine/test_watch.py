@@ -65,6 +65,17 @@ def test_a_term_that_is_detached_is_named_from_its_iteration_on():
     assert f"iteration 200 on ({reason}" in str(log)
 
 
+def test_a_small_fault_that_lasts_is_named_and_doubt_is_no_praise():
+    log = bench.watch(lambda x: float(x @ x), every=1, share=math.inf)
+    for at in np.random.default_rng(0).normal(size=(5, 60)):
+        log(at, 2.0 * at * (np.arange(60) > 0))
+    assert log.first[0] == 2
+    rng = np.random.default_rng(0)
+    log = bench.watch(lambda x: float(x @ x) + rng.normal(), every=1, share=math.inf)
+    log(np.ones(2), 4.0 * np.ones(2))
+    assert str(log).endswith("nothing is known of the gradient")
+
+
 def test_a_step_that_becomes_unstable_is_named():
     log, _ = descend(True, "unstable", 200, 240)
     assert log.first == (200, "explodes")
