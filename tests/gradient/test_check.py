@@ -44,6 +44,7 @@ def noisy(function, size):
 
 FAULTS = {
     "nan": ("nan_gradient", cost, lambda x: np.nan * x),
+    "inf in one component": ("nan_gradient", cost, lambda x: gradient(x) + first(np.inf)),
     "noise in the gradient": ("nondeterministic", cost, noisy(gradient, 1e-7)),
     "noise in the cost": ("nondeterministic", noisy(cost, 1e-12), gradient),
     "cost that depends on its place in a batch": (
@@ -55,15 +56,27 @@ FAULTS = {
     "cast to int": ("staircase", lambda x: stairs(x, 1e-6), lambda x: 0.0 * x),
     "cast to int of a term": ("staircase", lambda x: cost(x) + stairs(x, 1e-6), gradient),
     "wide treads": ("staircase", lambda x: cost(x) + stairs(x, 1e-4), gradient),
+    "narrow treads": ("staircase", lambda x: cost(x) + stairs(x, 1e-8), gradient),
     "theta in single precision": ("precision", lambda x: cost(single(x)), gradient),
     "cost in single precision": ("precision", lambda x: single(cost(x)), gradient),
+    "term in single precision": (
+        "precision",
+        lambda x: cost(x) + np.exp(single(x)).sum(axis=0),
+        lambda x: gradient(x) + np.exp(x),
+    ),
     "stopped": ("disconnected", cost, lambda x: 0.0 * x),
     "one component stopped": ("disconnected", cost, lambda x: gradient(x) * [0.0, 1.0, 1.0]),
     "half": ("wrong_factor", cost, lambda x: 0.5 * gradient(x)),
     "one part in a thousand": ("wrong_factor", cost, lambda x: 1.001 * gradient(x)),
     "sign": ("wrong_factor", cost, lambda x: -gradient(x)),
+    "sign of one component": ("wrong_factor", cost, lambda x: gradient(x) * [-1.0, 1.0, 1.0]),
     "coupling left out": ("missing_term", cost, lambda x: np.cos(x) + 0.2 * x),
     "term of one component left out": ("missing_term", cost, lambda x: gradient(x) - first(np.cos(x[0]))),
+    "large term too many in one component": (
+        "missing_term",
+        cost,
+        lambda x: gradient(x) + first(8.0 * np.cos(9.0 * x[0])),
+    ),
     "little left out": ("missing_term", cost, lambda x: gradient(x) - 0.004 * np.cos(x) * [1.0, 0.7, 0.9]),
     "term that acts only here": (
         "missing_term",

@@ -67,6 +67,10 @@ def test_measured_noise_explains_eight_of_its_standard_deviations_and_no_more():
         assert wrong.verdict == "wrong_adjoint", wrong
 
 
+def test_a_slope_that_changes_over_wide_steps_is_nonlinear():
+    assert judge(of_differences(SLOPE * (1.0 + (EPS / EPS[0]) ** 2), EPS, SLOPE)).verdict == "nonlinear"
+
+
 def test_wide_differences_that_smaller_steps_contradict_are_not_believed():
     """They agree with each other to the last digit, on nothing; the smaller ones agree to six digits, on the slope."""
     differences = np.r_[np.full(6, 1e-3), 0.3, SLOPE + 1e-6 * (-1.0) ** np.arange(10)]
