@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial, wraps
 from typing import Any
@@ -30,10 +28,10 @@ from bench.examine.smoothing import (
     measure_smoothed,
 )
 from bench.examine.stages import GradientStages
-from bench.gradient import Check
+from bench.gradient import FAULTS, Check
 from bench.gradient.rules import RULES, SUSPICIOUS
 from bench.simulator.clock import Clock, OutOfTime, parse_duration
-from bench.simulator.simulator import Simulator
+from bench.simulator.simulator import Simulator, accepts
 from bench.simulator.tree import ParameterTree
 
 TOLERANCE = 1e-4
@@ -121,6 +119,8 @@ def examine(
         math.inf if calls is None else float(calls),
         parse_duration(compile_budget, "compile_budget"),
     )
+    if not (refined is None or callable(refined)):
+        raise UserError(f"refined is a function of theta, not {type(refined).__name__}")
     if isinstance(noise, str) and noise == KEY:
         noise, (cost, grad, refined) = WORDS_OF_A_KEY, map(_with_key, (cost, grad, refined))
     if not isinstance(noise, int | np.integer) or noise < 0:
@@ -138,13 +138,17 @@ def examine(
         horizons=tuple(int(steps) for steps in horizons),
     )
     expectable = [name for name, rule in RULES.items() if rule.kind in ("open", "broken") or name in NOISE_CAUSES]
+    if expect in FAULTS and expect not in expectable:
+        raise UserError(f"expect={expect}: a wrong gradient cannot be expected")
     if expect and expect not in expectable:
         raise unknown("expect", expect, expectable)
     named = {
         "name": name or _function_name(cost),
         "gradient": _function_name(grad),
         "expect": expect,
-        "takes_steps": all(_takes_steps(function) for function in (cost, grad) if callable(function)),
+        "takes_steps": all(
+            accepts(function, theta, *[0] * bool(noise), steps=1) for function in (cost, grad) if callable(function)
+        ),
     }
     cost, grad, refined = map(_with_own_warnings, (cost, grad, refined))
     # a cost of huge or infinite numbers overflows in the differences too, where a warning would tell nothing
@@ -217,12 +221,6 @@ def _with_key(function: Any) -> Any:
         return function(theta, jax.random.wrap_key_data(words), **settings)
 
     return keyed
-
-
-def _takes_steps(function: Callable[..., Any]) -> bool:
-    with suppress(TypeError, ValueError):  # a built-in function may have no signature
-        return bool(inspect.signature(function).bind_partial(steps=1))
-    return False
 
 
 def _function_name(function: Any) -> str:

@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from bench.errors import UserError, failure, needing_sweeps
+from bench.errors import UserError, needing_sweeps
 from bench.examine.few import ROUNDED, ROUNDS, FewSteps
 from bench.examine.lines import scan
 from bench.examine.subspace import Group, Subspace
 from bench.gradient import FAULTS, RULES, TRUSTED
 from bench.measure.statistics import ends
-from bench.simulator.simulator import Simulator
+from bench.simulator.simulator import Simulator, reason_of
 from bench.simulator.tree import ParameterTree, numbers
 
 EQUAL = 4
@@ -78,10 +78,13 @@ class Watch:
     def __init__(
         self, cost: Callable[..., Any], every: int = 50, out: str | Path | None = None, share: float = 0.1
     ) -> None:
-        is_real = callable(cost) and isinstance(every, Integral) and isinstance(share, Real)
-        if not (is_real and every > 0 and share > 0):
-            wanted = "the cost is a function of theta, every= a whole number above 0, share= a number above 0"
-            raise UserError(f"{wanted}; given are {cost!r}, every={every!r}, share={share!r}")
+        for is_valid, text in (
+            (callable(cost), f"cost={cost!r} is not a function of theta"),
+            (isinstance(every, Integral) and every > 0, f"every={every!r} is not a whole number above 0"),
+            (isinstance(share, Real) and share > 0, f"share={share!r} is not a number above 0"),
+        ):
+            if not is_valid:
+                raise UserError(text)
         self.cost, self.every, self.share, self.out = cost, every, share, out
         if out:
             with open(out, "a"):
@@ -119,7 +122,7 @@ class Watch:
             try:
                 self._measure(row, theta, gradient, given)
             except Exception as error:
-                row["reason"] = str(error) if isinstance(error, UserError) else failure(error)["reason"]
+                row["reason"] = reason_of(error)
         row["seconds"] = time.perf_counter() - began
         self.rows.append(row)
         if not self.out:

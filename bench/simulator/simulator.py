@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import io
 import sys
 from collections import Counter, deque
 from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -38,12 +39,19 @@ PACKAGE = str(Path(__file__).parents[1])
 """Folder of this package."""
 
 
-def _reason(error: Exception) -> str:
+def reason_of(error: Exception) -> str:
     """Return the message of an exception and where it was raised, without the frames of this package that call the user's code."""
     at = error.__traceback__
     while at and at.tb_next and at.tb_frame.f_code.co_filename.startswith(PACKAGE):
         at = at.tb_next
     return str(error) if isinstance(error, UserError) else failure(error.with_traceback(at))["reason"]
+
+
+def accepts(function: Callable[..., Any], *arguments: Any, **settings: Any) -> bool:
+    """Return whether the signature of a function allows a call."""
+    with suppress(TypeError, ValueError):  # a built-in function may have no signature
+        return bool(inspect.signature(function).bind(*arguments, **settings))
+    return False
 
 
 class Simulator:
@@ -69,7 +77,7 @@ class Simulator:
         if not callable(cost):
             raise UserError(f"the cost is a function of theta, not {type(cost).__name__}")
         batch, self.fixed = _parse_batch(batch)
-        if not (grad is None or callable(grad) or grad in LIBRARIES):
+        if not (grad is None or callable(grad) or str(grad) in LIBRARIES):
             raise unknown("grad", grad, (*LIBRARIES, "a function of theta"))
         if isinstance(grad, str) and find_spec(grad) is None:
             raise UserError(f"grad={grad} needs a library that is not installed: pip install {grad}")
@@ -112,12 +120,17 @@ class Simulator:
             try:
                 with redirect_stdout(self.printed), redirect_stderr(self.printed):
                     value = function(theta, *arguments, **settings)
-                if value is None:
-                    raise UserError(f"{name} returned None, as without a return statement")
+                if value is None or (isinstance(value, tuple) and name == "the cost"):
+                    what = "None, as without a return statement" if value is None else "a tuple, not one number"
+                    raise UserError(f"{name} returned {what}")
                 return value
+            except TypeError as error:
+                if accepts(function, theta, *arguments, **settings):
+                    raise
+                given = f"theta{', w' * len(arguments)}{', steps' * len(settings)}"
+                raise UserError(f"{name} must accept ({given}): {error}") from None
             except SystemExit as error:
-                code = "" if error.code is None else error.code
-                raise RuntimeError(f"it ended the process by sys.exit({code})") from None
+                raise RuntimeError(f"it ended the process by sys.exit({''.join(map(str, error.args))})") from None
 
         return call
 
@@ -211,7 +224,7 @@ class Simulator:
             self.clock.count(kind, n, taken, warm=not is_first)
             out[..., start : start + n] = results[..., :n]
             if kind == "costs" and len(self._distinct) < 16 * DISTINCT:
-                self._distinct.update(float(one) for one in results[:n] if _is_telling(one))
+                self._distinct.update(filter(_is_telling, results[:n].tolist()))
         return out
 
     @property
@@ -230,7 +243,7 @@ class Simulator:
                 raise
             if self.clock.is_interrupted:
                 raise OutOfTime from None
-            reason = _reason(error)
+            reason = reason_of(error)
             if isinstance(self._grad, str) and not (is_cost or self.clock.counts[kind]):
                 advice = f"write it with {self._grad} alone, or give grad=FUNCTION"
                 raise UserError(f"{self._grad} cannot differentiate the cost: {advice} ({reason})") from None
@@ -275,21 +288,20 @@ class Simulator:
             if not self._accepts(batch):
                 raise UserError(f"the cost does not accept batch={batch}: {self._batch_error}")
             return batch
+        advice = "It must accept theta and return one number"
         try:
             value = self._call_once()
+        except UserError:
+            raise
         except Exception as error:
-            problem = _reason(error)
-            is_misread = isinstance(error, TypeError | AttributeError | LookupError)
-            advice = (
-                "It must accept theta and return one number" if is_misread else "Give a theta at which it has a value"
-            )
+            problem = reason_of(error)
+            if not isinstance(error, TypeError | AttributeError | LookupError):
+                advice = "Give a theta at which it has a value"
         else:
             problem = f"it returned an array of shape {value.shape}"
-            advice = "It must accept theta and return one number"
             if value.size == 1:
                 self._check_cost(value)
-                self.first_value = float(value.ravel()[0])
-                self._distinct |= {self.first_value} if _is_telling(self.first_value) else set()
+                self._distinct.update(filter(_is_telling, [self.first_value]))
                 return self._detect_vmap(batch)
         for layout in ("columns", "rows"):
             if self.layout.flat and self._accepts(layout):
@@ -304,15 +316,10 @@ class Simulator:
 
     def _call_once(self) -> np.ndarray:
         """Return the cost of theta without noise as an array."""
-        parts = self._repeated(1)
-        if self.library == "jax":
-            with self.clock.interrupt_when_over(first=True):
-                value = self._by_jax("cost", "loop", *parts)
-            self.clock.count("costs", 1, 0.0, warm=False)
-            return as_numpy(value)
+        parts, is_jax = self._repeated(1), self.library == "jax"
         try:
             with self.clock.interrupt_when_over(first=True):
-                (value,) = self._each(self._cost, *parts)
+                value = self._by_jax("cost", "loop", *parts) if is_jax else self._each(self._cost, *parts)[0]
         except RuntimeError as error:
             if self.library != "torch" or "dtype" not in str(error) or not self._double:
                 raise
@@ -321,17 +328,17 @@ class Simulator:
             return self._call_once()
         array = as_numpy(value)
         self.clock.count("costs", 1, 0.0, warm=False)
-        self._shapes.add(("costs", 1))
+        if not is_jax:
+            self._shapes.add(("costs", 1))
         return array
 
     def _check_cost(self, cost: np.ndarray) -> None:
-        """Record the precision of the cost's value; raises :class:`UserError` unless it is a real number."""
-        if cost.dtype.kind == "c":
-            raise UserError(f"the cost is complex ({cost.dtype}): it must be one real number")
-        if cost.dtype.kind not in "fiub" and str(cost.dtype) != "bfloat16":
-            raise UserError(f"the cost is of type {cost.dtype}: it must be one real number")
+        """Record the cost's value and its precision; raises :class:`UserError` unless it is a real number."""
         if cost.dtype.kind == "f" or str(cost.dtype) == "bfloat16":
             self.precision = str(cost.dtype)
+        elif cost.dtype.kind not in "iub":
+            raise UserError(f"the cost is of type {cost.dtype}: it must be one real number")
+        self.first_value = float(cost.ravel()[0])
 
     def _detect_vmap(self, batch: str | None) -> str:
         """Return ``vmap`` if the library's vmap of the cost yields the same values, else ``loop``."""
@@ -351,11 +358,9 @@ class Simulator:
                     raise UserError(f"jax.vmap cannot map the cost: {failure(error)['reason']}") from None
             self.notes.append("jax.vmap cannot map the cost, so thetas are evaluated one by one")
             return "loop"
-        if batch == "vmap":
-            if self.library != "torch":
-                raise UserError("batch=vmap needs grad=jax or grad=torch: NumPy has no vmap")
-            return "vmap"
-        return "loop"
+        if batch == "vmap" and self.library != "torch":
+            raise UserError("batch=vmap needs grad=jax or grad=torch: NumPy has no vmap")
+        return batch or "loop"
 
     def _accepts(self, batch: str) -> bool:
         """Return whether the cost accepts several thetas as columns or rows and returns one number per theta."""
@@ -365,14 +370,12 @@ class Simulator:
             with self.clock.interrupt_when_over(first=True):
                 costs = as_numpy(self._whole(self._cost, batch, *map(self._array, self._repeated(count))))
         except Exception as error:
-            self._batch_error = failure(error)["reason"]
+            self._batch_error = reason_of(error)
             return False
         self.clock.count("costs", count, 0.0, warm=False)
         if costs.shape != (count,):
             self._batch_error = f"{count} thetas gave an array of shape {costs.shape}, not {(count,)}"
             return False
-        if costs.dtype.kind in "fiub":
-            self.first_value = float(costs[0])
         self._check_cost(costs)
         return True
 

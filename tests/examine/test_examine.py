@@ -263,11 +263,18 @@ def test_batches_are_told_from_the_result():
         ({"calls": 2.5}, "is not a number of calls"),
         ({"sigma": np.float32(-0.5)}, "above 0"),
         ({"sigma": [[0.1, 0.2], 0.3]}, "a list of numbers"),
+        ({"grad": np.ones(2)}, "a function of theta"),
+        ({"refined": True}, "refined is a function of theta, not bool"),
+        ({"expect": "wrong_factor"}, "a wrong gradient cannot be expected"),
+        ({"grad": lambda x, y: x}, r"the gradient must accept \(theta\): .* missing"),
+        ({"noise": 3}, r"the cost must accept \(theta, w\): "),
+        ({"horizons": [1, 2]}, r"the cost must accept \(theta, steps\): "),
+        ({"cost": lambda x: (1.0, {})}, "the cost returned a tuple"),
     ],
 )
 def test_bad_settings_say_what_is_allowed(settings, match):
     with pytest.raises(UserError, match=match):
-        examine(bowl, [1.0, 0.5], **settings)
+        examine(**{"cost": bowl, "theta": [1.0, 0.5]} | settings)
 
 
 @pytest.mark.parametrize(

@@ -161,7 +161,7 @@ def test_a_chart_is_drawn(tmp_path):
     "given", [{"cost": 1}, {"every": 0}, {"every": -1}, {"every": 1.5}, {"share": 0}, {"share": "a"}, {"share": None}]
 )
 def test_bad_input_is_named(given):
-    with pytest.raises(bench.UserError, match=f"{next(iter(given.values()))!r}"):
+    with pytest.raises(bench.UserError, match="^{}={!r} is not".format(*next(iter(given.items())))):
         bench.watch(**{"cost": abs} | given)
 
 
