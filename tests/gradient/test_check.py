@@ -62,6 +62,11 @@ FAULTS = {
     "half": ("wrong_factor", cost, lambda x: 0.5 * gradient(x)),
     "one part in a thousand": ("wrong_factor", cost, lambda x: 1.001 * gradient(x)),
     "sign": ("wrong_factor", cost, lambda x: -gradient(x)),
+    "half beside small jumps": (
+        "wrong_factor",
+        lambda x: cost(x) + 1e-3 * stairs(x, 1e-6),
+        lambda x: 0.5 * gradient(x),
+    ),
     "coupling left out": ("missing_term", cost, lambda x: np.cos(x) + 0.2 * x),
     "term of one component left out": ("missing_term", cost, lambda x: gradient(x) - first(np.cos(x[0]))),
     "little left out": ("missing_term", cost, lambda x: gradient(x) - 0.004 * np.cos(x) * [1.0, 0.7, 0.9]),
