@@ -121,7 +121,7 @@ def examine(
     )
     if not (refined is None or callable(refined)):
         raise UserError(f"refined is a function of theta, not {type(refined).__name__}")
-    if isinstance(noise, str) and noise == KEY:
+    if str(noise) == KEY:
         noise, (cost, grad, refined) = WORDS_OF_A_KEY, map(_with_key, (cost, grad, refined))
     if not isinstance(noise, int | np.integer) or noise < 0:
         raise UserError(f"noise={noise} is not the length of w in cost(theta, w): give a whole number, or {KEY}")
@@ -135,7 +135,7 @@ def examine(
         atol=_by_input(layout, atol, "atol", 0.0),
         allow_zero=_allowed(layout, allow_zero),
         seed=seed,
-        horizons=tuple(int(steps) for steps in horizons),
+        horizons=tuple(map(int, horizons)),
     )
     expectable = [name for name, rule in RULES.items() if rule.kind in ("open", "broken") or name in NOISE_CAUSES]
     if expect in FAULTS and expect not in expectable:

@@ -38,6 +38,8 @@ PLAINLY = ("smooth", "nonlinear", "mode_crossing")
 """Verdicts that count as right at the thetas drawn with :data:`FAR`."""
 CLEAR = (*PLAINLY, "zero", "nonfinite", "nondeterministic")
 """Verdicts on a direction that is not searched for a staircase."""
+SHARE = 0.1
+"""Smallest share of the jumps in the cost's change on a staircase, in units of the gradient's relative error that they explain."""
 
 
 @dataclass(frozen=True)
@@ -453,8 +455,9 @@ class _Checker:
 
         A cast to a shorter float keeps the gradient, a cast to an integer removes it.
         """
-        sample, tread = part.sample, float(np.ptp(np.diff(row)))
-        if GUARD * float(self.unit) * abs(sample.centre) >= tread:
+        sample, steps = part.sample, np.diff(row)
+        tread, jumped = float(np.ptp(steps)), np.abs(steps - np.median(steps)).sum() / np.abs(steps).sum()
+        if GUARD * float(self.unit) * abs(sample.centre) >= tread or jumped < SHARE * min(part.error, 1.0):
             return part
         coarse = judge(replace(sample, noise=max(sample.noise, tread)))
         verdict = "precision" if coarse.verdict in TRUSTED else "staircase"

@@ -54,8 +54,8 @@ DERIVATIVE = {
     "staircase": Rule(
         "fault",
         "the cost is constant between steps of its input: a cast to int, a rounding, a comparison",
-        "of {roughness.SCAN} costs in a row, {roughness.EDGES} or more isolated changes exceed all others {roughness.APART:g} times, and "
-        "the gradient is not the slope over them. Around theta: lines are flat between jumps, or the gradient misses "
+        "of {roughness.SCAN} costs in a row, {roughness.EDGES} or more isolated changes exceed all others {roughness.APART:g} times "
+        "and make up {check.SHARE:.0%} of the gradient's error, and the gradient is not the slope over them. Around theta: lines are flat between jumps, or the gradient misses "
         "{findings.SEEN:.0%} of the cost's change in jumps of one height at even distances; or the differences at the "
         "{direction.MIN_STEPS} smallest steps are 0 beside jumps, and wider ones are not, or the gradient is below {findings.RESIDUE:g} of a jump",
         f"{SMOOTHING}, or remove the rounding",

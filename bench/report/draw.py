@@ -160,6 +160,7 @@ def _panels(chart: Chart) -> list[Panel]:
         for name, style in looks_by_name([chart]).items()
     }
     is_plot, has_own, x = chart.kind in ("lines", "points"), chart.own_scales, chart.x[0]
+    parts = [*chart.frame.groupby(chart.panel, sort=False)] or [("", chart.frame)]
     return [
         Panel(
             chart,
@@ -176,7 +177,7 @@ def _panels(chart: Chart) -> list[Panel]:
             rows if has_own and (not is_plot or chart.across == 1) else chart.frame,
         )
         for y in chart.y[: None if is_plot and has_own else 1]
-        for name, rows in chart.frame.groupby(chart.panel, sort=False)
+        for name, rows in parts
     ]
 
 

@@ -180,7 +180,7 @@ class Simulator:
         """Number of thetas per call."""
         if self.batch == "loop":
             return 1
-        most = self.fixed or (BLOCK if self.library == "jax" else CHUNK)
+        most = BLOCK if self.library == "jax" else CHUNK
         return self.fixed or max(1, min(most, HELD // self.layout.vector.size))
 
     @property
@@ -385,7 +385,7 @@ class Simulator:
 
     def _each(self, function: Callable[..., Any], *parts: np.ndarray) -> list[Any]:
         """Return a user's function of each column of arrays."""
-        columns = ([self._array(part[:, i]) for part in parts] for i in range(parts[0].shape[1]))
+        columns = zip(*(map(self._array, part.T) for part in parts), strict=True)
         return [function(self._build_theta(vector), *own_noise) for vector, *own_noise in columns]
 
     # ------------------------------------------------------------------------------------------- values

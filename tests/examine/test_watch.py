@@ -153,6 +153,7 @@ def test_a_failing_cost_does_not_end_the_loop(tmp_path):
 
 def test_a_chart_is_drawn(tmp_path):
     log, _ = descend(True, "detached", 20, 40)
+    bench.watch(abs).draw(tmp_path / "log.png")  # before the loop
     log.draw(tmp_path / "log.png")
     assert (tmp_path / "log.png").stat().st_size > 1000
 

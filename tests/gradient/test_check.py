@@ -70,6 +70,11 @@ FAULTS = {
     "one part in a thousand": ("wrong_factor", cost, lambda x: 1.001 * gradient(x)),
     "sign": ("wrong_factor", cost, lambda x: -gradient(x)),
     "sign of one component": ("wrong_factor", cost, lambda x: gradient(x) * [-1.0, 1.0, 1.0]),
+    "half beside small jumps": (
+        "wrong_factor",
+        lambda x: cost(x) + 1e-3 * stairs(x, 1e-6),
+        lambda x: 0.5 * gradient(x),
+    ),
     "coupling left out": ("missing_term", cost, lambda x: np.cos(x) + 0.2 * x),
     "term of one component left out": ("missing_term", cost, lambda x: gradient(x) - first(np.cos(x[0]))),
     "large term too many in one component": (
