@@ -366,8 +366,8 @@ class Findings:
         contradicted = [
             p
             for p in seen
-            if abs(p.program - p.difference)
-            > max(CONTRADICTED * p.uncertainty, DIGIT * max(abs(p.difference), abs(p.program)))
+            if abs(p.program - p.difference) > CONTRADICTED * p.uncertainty
+            and p.error > DIGIT
             and p.uncertainty < DIGIT * abs(p.difference)
             and not self._is_small(replace(p, verdict="wrong_adjoint"))
         ]
@@ -418,6 +418,20 @@ class Findings:
         lost = ((name, at, length) for name, t, costs, length in ways for at in t[~np.isfinite(costs)].tolist())
         return sorted((abs(at) * length, name, at) for name, at, length in lost)
 
+    @property
+    def _exceeds_noise(self) -> bool:
+        """Whether the gradient of a noisy cost is wrong; one with noise of its own by more than that makes, and twice a slope."""
+        parts, repeats = self.settled.components, self.repeats
+        if repeats.of_gradient <= repeats.floor_of_gradient:
+            return self.settled.cause in UNEQUAL
+        noise = repeats.of_gradient * np.linalg.norm([p.program for p in parts])
+        return any(
+            p.verdict in UNEQUAL
+            and p.distance > 2.0
+            and abs(p.program - p.difference) > CONTRADICTED * (p.uncertainty + repeats.spread / p.step + noise)
+            for p in parts
+        )
+
     def _verdicts(self) -> Iterator[tuple[str, bool, str]]:
         """Yield each verdict about the derivative at theta, whether it holds, and its facts: the first that holds decides."""
         repeats = self.repeats
@@ -426,9 +440,8 @@ class Findings:
         yield "undecided", not self.check.parts, self.n_checked
         is_noisy = repeats.spread > repeats.floor and not repeats.has_state
         yield "nondeterministic", repeats.is_large and not is_noisy, self.spread_text
-        known = f"{self.spread_text}; {counted(len(self.resolved_parts), 'slope')} known to 10%"
-        is_noisy &= repeats.of_gradient > repeats.floor_of_gradient or self.settled.cause not in UNEQUAL
-        yield "noisy", is_noisy, known
+        is_noisy &= not self._exceeds_noise
+        yield "noisy", is_noisy, f"{self.spread_text}; {counted(len(self.resolved_parts), 'slope')} known to 10%"
         if self.wrong_checks:
             yield from self._verdicts_on_failed(self.wrong_checks[0].cause)
         yield from self._verdicts_on_passed()
@@ -638,10 +651,9 @@ class Findings:
         return bool(self._gaps) and all((gradient <= AGREES * own).all() for gradient, own in self._gaps)
 
     @cached_property
-    def _gaps(self) -> list[tuple[np.ndarray, np.ndarray]]:
+    def _gaps(self) -> list[np.ndarray]:
         """Distances by theta of gradient and of own differences from a refined cost: by component, and along random directions."""
-        gaps = [np.linalg.norm(slopes[:, :2] - slopes[:, 2:], axis=2).T for slopes in self.explained.refined or ()]
-        return [(gradient, own) for gradient, own in gaps]
+        return [np.linalg.norm(slopes[:, :2] - slopes[:, 2:], axis=2).T for slopes in self.explained.refined or ()]
 
     @property
     def derivative(self) -> str:

@@ -206,6 +206,13 @@ CASES = {
     "noise of the cost": (3, "noisy", noisy, slope, {}),
     "expected noise of the cost": (0, "noisy", noisy, slope, {"expect": "noisy"}),
     "noise of the gradient too": (3, "noisy", noisy, lambda x: slope(x) * RANDOM.normal(1.0, 1e-3), {}),
+    "a multiple of a noisy gradient": (
+        1,
+        "",
+        noisy,
+        lambda x: slope(x) * [1.0, 50.0] * RANDOM.normal(1.0, 1e-3),
+        {},
+    ),
     "noise of the gradient alone": (1, "nondeterministic", swing, lambda x: slope(x) * RANDOM.normal(1.0, 0.1), {}),
     "a root to a thousandth": (3, "adaptive", root, root_slope, {"theta": [1.3, 0.9]}),
     "a third too much of a root to a millionth": (
