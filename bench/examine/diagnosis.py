@@ -261,7 +261,9 @@ def is_adaptive(
     line = scan(partial(stages.costs_along, direction), direction, noise, LONG, effort, stages.simulator.unit)
     lines = [*lines, line]
     slope = max(_slope_of_breaks(one, stages.scale) for one in lines)
-    is_bounded = size > EXPLAINED_IF_SMALL * slope and sum(len(one.breaks) for one in lines) >= FEWEST_BREAKS
+    # a line whose jumps make up the cost shows events, and not what the solver's steps change
+    n_breaks = sum(len(one.breaks) for one in lines if _slope_of_breaks(one, stages.scale))
+    is_bounded = size > EXPLAINED_IF_SMALL * slope and n_breaks >= FEWEST_BREAKS
     is_small = all(p.error <= NEAR for p in outcome.components if p.verdict in SUSPICIOUS)
     return size <= EXPLAINED * slope or (relative_error(outcome) <= NEAR and is_small and not is_bounded)
 

@@ -47,8 +47,6 @@ DEVIATIONS = 4.0
 """Standard deviations of the slope along a random direction that errors within the tolerance do not exceed."""
 SEEN_ALONE = 4.0
 """Multiple of a slope's error from which the error of one number shows along most random directions."""
-NOISES = 4.0
-"""Largest error of a derivative that noise of the gradient explains, in multiples of that noise."""
 AGREES = 0.5
 """Largest distance of a gradient that agrees with a refined cost, relative to that of the cost's own differences."""
 AS_FAR = 4.0
@@ -368,8 +366,8 @@ class Findings:
         contradicted = [
             p
             for p in seen
-            if abs(p.program - p.difference)
-            > max(CONTRADICTED * p.uncertainty, DIGIT * max(abs(p.difference), abs(p.program)))
+            if abs(p.program - p.difference) > CONTRADICTED * p.uncertainty
+            and p.error > DIGIT
             and p.uncertainty < DIGIT * abs(p.difference)
             and not self._is_small(replace(p, verdict="wrong_adjoint"))
         ]
@@ -420,6 +418,19 @@ class Findings:
         lost = ((name, at, length) for name, t, costs, length in ways for at in t[~np.isfinite(costs)].tolist())
         return sorted((abs(at) * length, name, at) for name, at, length in lost)
 
+    @property
+    def _exceeds_noise(self) -> bool:
+        """Whether the gradient of a noisy cost is wrong; one with noise of its own by more than all noise makes."""
+        parts, repeats = self.settled.components, self.repeats
+        if self.settled.cause not in FAULTS or not repeats.of_gradient > repeats.floor_of_gradient:
+            return self.settled.cause in FAULTS
+        noise = repeats.of_gradient * np.linalg.norm([p.program for p in parts])
+        return any(
+            p.verdict in FAULTS
+            and abs(p.program - p.difference) > CONTRADICTED * (p.uncertainty + repeats.spread / p.step + noise)
+            for p in parts
+        )
+
     def _verdicts(self) -> Iterator[tuple[str, bool, str]]:
         """Yield each verdict about the derivative at theta, whether it holds, and its facts: the first that holds decides."""
         repeats = self.repeats
@@ -428,10 +439,8 @@ class Findings:
         yield "undecided", not self.check.parts, self.n_checked
         is_noisy = repeats.spread > repeats.floor and not repeats.has_state
         yield "nondeterministic", repeats.is_large and not is_noisy, self.spread_text
-        known = f"{self.spread_text}; {counted(len(self.resolved_parts), 'slope')} known to 10%"
-        wrong = max((part.error for part in self.settled.parts if part.verdict in FAULTS), default=math.inf)
-        is_noisy &= self.settled.cause not in FAULTS or wrong <= NOISES * repeats.of_gradient
-        yield "noisy", is_noisy, known
+        is_noisy &= not self._exceeds_noise
+        yield "noisy", is_noisy, f"{self.spread_text}; {counted(len(self.resolved_parts), 'slope')} known to 10%"
         if self.wrong_checks:
             yield from self._verdicts_on_failed(self.wrong_checks[0].cause)
         yield from self._verdicts_on_passed()
@@ -641,10 +650,9 @@ class Findings:
         return bool(self._gaps) and all((gradient <= AGREES * own).all() for gradient, own in self._gaps)
 
     @cached_property
-    def _gaps(self) -> list[tuple[np.ndarray, np.ndarray]]:
+    def _gaps(self) -> list[np.ndarray]:
         """Distances by theta of gradient and of own differences from a refined cost: by component, and along random directions."""
-        gaps = [np.linalg.norm(slopes[:, :2] - slopes[:, 2:], axis=2).T for slopes in self.explained.refined or ()]
-        return [(gradient, own) for gradient, own in gaps]
+        return [np.linalg.norm(slopes[:, :2] - slopes[:, 2:], axis=2).T for slopes in self.explained.refined or ()]
 
     @property
     def derivative(self) -> str:

@@ -202,7 +202,7 @@ class Watch:
             [Column("gradient_norm"), Column("error"), interval("cosine", log=False)],
         )
         marks = [Mark(code, at) for at, code in filter(None, [self.first])]
-        frame = pd.DataFrame(self.rows, columns=COLUMNS)
+        frame = pd.DataFrame(self.rows or [dict.fromkeys(COLUMNS, math.nan)])
         draw(Chart("watch", frame, x, y, "points", marks=marks, own_scales=True)).savefig(path, dpi=150)
 
 

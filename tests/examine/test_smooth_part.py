@@ -81,3 +81,44 @@ def test_a_loose_solver_leaves_open_what_its_steps_may_explain(answer, factor, r
     slope = complex_step(exact)
     report = bench.examine(cost, grad=lambda x: slope(x) * [factor, 1.0, 1.0], **given)
     assert report.derivative == answer, str(report)
+
+
+def bounce(x, is_derivative=False):
+    """Return height and speed of a bouncing ball with drag after 1.2 s, or their derivatives by ``x``: height, speed, restitution."""
+
+    def rates(_t, z):
+        speed, s = z[1], z[2:].reshape(-1, 3)
+        return np.r_[speed, -9.81 - 0.1 * speed * abs(speed), s[1:].ravel(), (-0.2 * abs(speed) * s[1:]).ravel()]
+
+    def hit(_t, z):
+        return z[0]
+
+    hit.terminal, hit.direction = True, -1
+    t, z = 0.0, np.r_[x[:2], np.eye(2, 3).ravel() if is_derivative else []]
+    while True:
+        path = solve_ivp(rates, (t, 1.2), z, events=hit)
+        t, z = path.t[-1], path.y[:, -1]
+        if path.status == 0:
+            return z[2:].reshape(2, 3) if is_derivative else z
+        before, after = rates(t, z[:2]), rates(t, np.array([0.0, -x[2] * z[1]]))
+        s = z[2:].reshape(-1, 3)
+        if is_derivative:
+            later = -s[0] / z[1]
+            s = [[1.0], [-x[2]]] * (s + np.outer(before, later)) - np.outer(after, later) - [[0, 0, 0], [0, 0, z[1]]]
+        z = np.r_[1e-12, -x[2] * z[1], s.ravel()]
+
+
+@pytest.mark.parametrize("theta", [[1.0, 0.5, 0.8], [0.9, 0.2, 0.85]])
+def test_jumps_of_events_do_not_bound_what_the_steps_of_a_solver_explain(theta):
+    """The number of bounces makes up the cost on a long line, so that a few breaks there say nothing of the solver's steps."""
+
+    def cost(x):
+        height, speed = bounce(x)
+        return (height - 0.5) ** 2 + 0.1 * speed
+
+    def gradient(x):
+        height, speed = bounce(x, True)
+        return 2.0 * (bounce(x)[0] - 0.5) * height + 0.1 * speed
+
+    report = bench.examine(cost, theta, grad=gradient, calls=3000, progress=False)
+    assert report.derivative in ("right", "not shown"), str(report)

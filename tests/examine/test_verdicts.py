@@ -241,6 +241,13 @@ CASES = {
         lambda x: np.array([coupled(x)[1], 0.3 * np.cos(x[1])]),
         {"theta": [0.9, 0.4]},
     ),
+    "a multiple of a noisy gradient": (
+        1,
+        "",
+        noisy,
+        lambda x: slope(x) * [1.0, 50.0] * RANDOM.normal(1.0, 1e-3),
+        {},
+    ),
     "noise of the gradient alone": (1, "nondeterministic", swing, lambda x: slope(x) * RANDOM.normal(1.0, 0.1), {}),
     "a root to a thousandth": (3, "adaptive", root, root_slope, {"theta": [1.3, 0.9]}),
     "a third too much of a root to a millionth": (
