@@ -1,7 +1,6 @@
 """``python -m bench``."""
 
 import contextlib
-import gc
 import os
 import select
 import signal
@@ -29,8 +28,6 @@ def command() -> None:
     from bench.errors import failure
     from bench.host import guard
     from bench.model import registry
-
-    gc.freeze()  # what imports have made stays
 
     descriptor, parent = map(int, channel.split())
     os.set_inheritable(descriptor, False)

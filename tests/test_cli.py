@@ -8,21 +8,12 @@ import sys
 import pandas as pd
 import pytest
 from bench.plugins.studies.bias_variance.columns import COLUMNS
+from helpers import TINY
 from trees import INHERITED
 
 from bench.cli import VERBS, main
 from bench.experiment import config, grid
 from bench.experiment.columns import IDENTITY
-
-TINY = [
-    "scenes=[heaviside]",
-    "backends=[numpy]",
-    "estimators=[fobg,reinforce]",
-    "samples=8",
-    "repeats=4",
-    "name=tiny",
-    "workers=0",
-]
 
 
 def test_run_then_report_then_plan(tmp_path, capsys):

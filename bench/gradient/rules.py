@@ -235,7 +235,7 @@ EXAMINATION = {
         "open",
         "the cost draws noise of its own, which hides the slope",
         "the spread of equal calls of the cost is above u^{stages.SMALL} of it and does not come from the call before, and nothing else is wrong; or the gradient has "
-        "noise too, and no difference is {findings.CONTRADICTED:g} errors and twice itself away from it",
+        "noise too, and no difference is {findings.CONTRADICTED:g} errors, with those by noise, away from it",
         "fix the seed, or pass the noise as w and set noise=N",
         EXPECTED,
     ),
@@ -265,7 +265,7 @@ EXAMINATION = {
         "exactly the derivative of the solution",
         "`missing_term` or `wrong_adjoint` where a loop's length depends on theta, and the error is at most {diagnosis.EXPLAINED:g} times "
         "the jumps and kinks of a line, as slopes over its length; or {diagnosis.EXPLAINED_IF_SMALL:g} times, or there are fewer than "
-        "{diagnosis.FEWEST_BREAKS}, where it is at most {diagnosis.NEAR:.0%}; lines whose jumps are above {diagnosis.MOST_OF_CHANGE:.0%} of the change do not count. With `refined`: the gradient is at "
+        "{diagnosis.FEWEST_BREAKS}, where it and that of each wrong component are at most {diagnosis.NEAR:.0%}; lines whose jumps are above {diagnosis.MOST_OF_CHANGE:.0%} of the change do not count. With `refined`: the gradient is at "
         "most {findings.AGREES:g} times as far from it as the differences at each theta, or {findings.AS_FAR:g} times beside such a loop. "
         "Of a rough cost: no slope over wide steps is known to {smooth_part.LIMIT:.0%}",
         "give the cost at a tighter tolerance; accept it if the gradient is meant to be that one's",

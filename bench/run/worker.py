@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import faulthandler
-import gc
 import json
 import os
 import pickle
@@ -54,7 +53,6 @@ def main() -> None:
     # Ctrl-C reaches the run, which ends its workers
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     faulthandler.enable(all_threads=False)
-    gc.freeze()  # what imports have made stays
     sys.argv[:] = ["bench-worker"]
     with suppress(ConnectionLost):
         _serve(Connection(descriptor))

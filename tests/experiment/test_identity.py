@@ -6,6 +6,7 @@ from dataclasses import replace
 import pandas as pd
 import pytest
 from bench.plugins.studies.bias_variance.columns import COLUMNS
+from helpers import TINY
 
 from bench.cli import main
 from bench.errors import UserError
@@ -108,16 +109,6 @@ def test_refused_cells_have_keys():
 
 
 # -------------------------------------------------------------------------------------------------- policies
-
-TINY = [
-    "scenes=[heaviside]",
-    "backends=[numpy]",
-    "estimators=[fobg,reinforce]",
-    "samples=8",
-    "repeats=4",
-    "name=tiny",
-    "workers=0",
-]
 
 
 @pytest.mark.slow

@@ -222,7 +222,7 @@ def ranked(lines: pd.DataFrame, by: Sequence[str], trainer: str = "family") -> p
     ``behind`` is how much higher the first of its group ends than such a setting, with its interval.
 
     ``first``: the highest return; ``behind``: its runs end lower than those of the first, by this interval and the test of Mann and
-    Whitney (1947) at 5%, even if the first had only its worst settings, as many as this one; ``tied``: the test finds no difference;
+    Whitney (1947) at 5%, even if the first had only its worst settings, as many as this one; ``tied``: they find no difference;
     ``open``: neither, or none of the group is behind; ``not run``: the chosen setting has no seeds that are reported;
     ``no result``: no run ended with a finite return.
     """
@@ -241,10 +241,9 @@ def ranked(lines: pd.DataFrame, by: Sequence[str], trainer: str = "family") -> p
         own = settings[best[trainer]]
         for index, line in chosen.iterrows():
             fewest = own.iloc[max(len(own) - len(settings[line[trainer]]), 0)]
-            leads = is_lower(line["returns"], best["returns"])
-            leads_by_fewer = isinstance(fewest, np.ndarray) and is_lower(line["returns"], fewest)
-            verdicts[index] = ("behind" if leads_by_fewer else "open") if leads else "tied"
-            behind[index] = middle_with_interval("behind", line["returns"], best["returns"])
+            behind[index], leads = distance_below(line["returns"], best["returns"])
+            leads_by_fewer = isinstance(fewest, np.ndarray) and distance_below(line["returns"], fewest)[1]
+            verdicts[index] = "tied" if not leads else "behind" if leads_by_fewer else "open"
         del behind[best.name]
         verdicts[best.name] = "first"
         if len(chosen) > 1 and not (verdicts[chosen.index] == "behind").any():
@@ -252,12 +251,15 @@ def ranked(lines: pd.DataFrame, by: Sequence[str], trainer: str = "family") -> p
     return pd.DataFrame({"verdict": verdicts}).join(pd.DataFrame(behind, index=ends("behind", "123")).T.astype(float))
 
 
-def is_lower(returns: np.ndarray, others: np.ndarray) -> bool:
-    """Return whether runs end lower than others, by an interval above 0 and the test of Mann and Whitney, both at 5%."""
+def distance_below(returns: np.ndarray, others: np.ndarray) -> tuple[dict[str, Any], bool]:
+    """Return by how much runs end lower than others, with an interval, and whether they do.
+
+    They do if the interval is above 0 and the test of Mann and Whitney finds a difference, both at 5%.
+    """
     from scipy.stats import mannwhitneyu
 
     distance = middle_with_interval("behind", returns, others)
-    return bool(distance["behind_low"] > 0.0 and mannwhitneyu(others, returns).pvalue < 0.05)
+    return distance, bool(distance["behind_low"] > 0.0 and mannwhitneyu(others, returns).pvalue < 0.05)
 
 
 def middle_with_interval(name: str, values: np.ndarray, *above: np.ndarray) -> dict[str, Any]:
