@@ -90,7 +90,7 @@ def _traced(program: Program, function: str, dtype: str) -> _Source:
     wrt = {"value": None, "grad": "theta", "score": "scored"}[function]
     scored = {"scored": program.dim}
     rollout = trace.traced(log_probability, shapes | scored) if wrt == "scored" else trace.traced(cost, shapes)
-    text = emit.source(rollout, dtype, wrt, program.dim, f"{function} of {program.scene.name}", cache=False)
+    text = emit.source(rollout, dtype, wrt, program.dim, f"{function} of {program.scene.name}")
     flat = [np.concatenate(part) if part else np.zeros(1) for part in (rollout.constants, rollout.indices)]
     return _Source(text, rollout.length, flat[0].astype(dtype), flat[1].astype(np.int64))
 

@@ -59,7 +59,6 @@ Wanted = Callable[[Node], bool]
 def backward(loop: Loop, kept: list[int], wrt: str) -> Backward:
     """Return the expressions of the backward pass by ``wrt`` through the carries ``kept``."""
     graph, (live, outer) = loop.graph, _moving(loop, kept, wrt)
-    assert loop.result is not None
     # after the loop
     seeded = [(loop.result, graph.literal(1.0))]
     found = pullback(graph, seeded, lambda node: node.op == wrt or (node.op == "final" and node.data in live))

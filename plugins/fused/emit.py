@@ -3,6 +3,29 @@
 Each value is computed in the outermost possible loop: once per call if it depends only on parameters, once per step if
 it is the same in all lanes, once per lane before or after the time loop, otherwise in each step of each lane. The
 forward pass stores the carries that the backward pass reads. The backward pass recomputes the other values of a step.
+
+A kernel does this for each block of lanes, a method of :class:`_Kernel` each:
+
+1. before the time loop, compute the first carries and the values that the loop reads
+2. forward loop: store the carries of the step in ``kept``, then make the step
+3. after the loop, write the value; or, for a derivative, seed the cotangents of the carries
+4. backward loop: add each step's contribution to the derivative, and step the cotangents back
+5. add what the start and the values from before the loop contribute
+
+Variables in the generated code, numbered by node unless stated otherwise:
+
+- ``u``: the same in all lanes and steps (uniform); ``r``: its reciprocal
+- ``s``: the same in all lanes of a step
+- ``v``: of one lane, in one loop over lanes
+
+Slots are the places of ``lane`` that hold a value per lane from one loop over lanes to the next, named here by
+
+- ``c``: a carry, by its number
+- ``k``: a value from before the time loop that is read later
+- ``a``: the cotangent (adjoint) of a carry, by its number
+- ``t``: the sum over steps of contributions to the cotangent of a ``k`` value (total)
+- ``o``: the contribution of a step to the entry of the result that a table of indices names, by the number of the table
+- ``big``, ``wild``: whether an angle or a slope was too large
 """
 
 from __future__ import annotations
@@ -33,7 +56,7 @@ BEYOND = F({beyond!r})
 at = np.uint64
 {helpers}
 
-@njit(nogil=True, error_model="numpy", fastmath={{"contract"}}, cache={cache})
+@njit(nogil=True, error_model="numpy", fastmath={{"contract"}}, cache=False)
 def kernel(parameter, constant, index, horizon, theta, theta_row, theta_column, scored, scored_row, scored_column,
            noise, noise_row, out, out_row, rows, start, stop):
     """Fill columns start to stop of ``out``; return whether all angles were small enough for fast sine and cosine, and
@@ -44,16 +67,15 @@ WIDE = LOOKUPS | {"theta", "scored", "noise", "carry", "final", "adjoint", "tota
 """Leaves that differ between lanes."""
 
 
-def source(loop: Loop, dtype: str, wrt: str | None, rows: int, title: str, cache: bool) -> str:
+def source(loop: Loop, dtype: str, wrt: str | None, rows: int, title: str) -> str:
     """Return source of a module whose ``kernel`` computes the function, or its derivative ``(rows, B)`` by ``wrt``.
 
     ``wrt`` is None, ``theta`` or ``scored``.
     """
     kernel = _Kernel(loop, wrt, rows)
     used = helpers({CALLS[node.op] for node in kernel.nodes if node.op in CALLS})
-    beyond = float(np.finfo(dtype).max) ** 0.25
-    text = HEAD.format(title=title, dtype=dtype, beyond=beyond, helpers=used, cache=cache)
-    return text + _renumbered("\n".join(f"    {line}" for line in kernel.lines())) + "\n"
+    head = HEAD.format(title=title, dtype=dtype, beyond=float(np.finfo(dtype).max) ** 0.25, helpers=used)
+    return head + _renumbered("\n".join(f"    {line}" for line in kernel.lines())) + "\n"
 
 
 def _block(head: str, lines: list[str]) -> list[str]:
@@ -66,107 +88,134 @@ class _Kernel:
 
     def __init__(self, loop: Loop, wrt: str | None, rows: int) -> None:
         self.loop, self.graph, self.wrt = loop, loop.graph, wrt
-        assert loop.result is not None
-        self.result = loop.result
-        kept = self._needed([loop.result]) if loop.length else []
-        self.back = back = Backward()
-        after = [loop.result]
-        if wrt:
-            self.back = back = backward(loop, kept, wrt)
-            after = [*back.seeds.values(), *back.ends.values()]
-            # the derivative may need fewer carries: for example, it does not read the accumulated cost
-            kept = self._needed([*after, *(loop.step[i] for i in back.history)], back.history)
-        self.forward, self.starts = ({i: part[i] for i in kept} for part in (loop.step, loop.first))
+        self.back = back = backward(loop, self._needed([loop.result]), wrt) if wrt else Backward()
+        after = [*back.seeds.values(), *back.ends.values()] if wrt else [loop.result]
+        # a derivative may need fewer carries than the value: for example, it does not read the accumulated cost
+        carries = self._needed([*after, *(loop.step[i] for i in back.history)], back.history)
+        self.forward, self.starts = ({i: part[i] for i in carries} for part in (loop.step, loop.first))
         inside = [*self.forward.values(), *back.inside()]
         self.nodes = reached([*self.starts.values(), *inside, *after])
         self.wide, self.timed = (dependent(self.nodes, leaves) for leaves in (WIDE, TIMED))
+        self.crossing = self._crossing(inside, after) if loop.length else {}
+        """The values from before the time loop that are read in it or after it, leaves included."""
+        self.marks = ["big"] * any(n.op in ("sin", "cos") for n in self.nodes) + ["wild"] * (wrt == "theta")
+        self.slots = {name: f"lane[{i * LANES} + l]" for i, name in enumerate(self._slot_names())}
+        """The code of each slot by its name."""
+        self.known = {i: self.slots[f"k{i}"] for i in self.crossing}
+        """The slots of values from before the time loop, by the numbers of their nodes."""
+        self.finals = self._leaves("final", "c", self.forward) | self.known
+        self.width = len(back.history) * LANES
+        """Number of stored carries of all lanes in one step."""
+        entries = np.sort([loop.indices[table] for table in back.tables], axis=None)
+        # whether steps add to entries of the result, since not every entry is written by exactly one of them
+        self.adds = bool(wrt) and not np.array_equal(entries, np.arange(rows))
+
+    def _crossing(self, inside: list[Node], after: list[Node]) -> dict[int, Node]:
+        """Return the values that depend on the lane but not on the step, and are read by ``inside`` or ``after``."""
         late = self.timed | dependent(self.nodes, {"final", "before", "total"})
         early = {n.number: n for n in self.nodes if n.number in self.wide - late}
         users = [n for n in reached([*inside, *after]) if n.number not in early]
         read = {arg.number for n in users for arg in n.args} | {n.number for n in [*inside, *after]}
-        self.crossing = {i: n for i, n in early.items() if i in read} if loop.length else {}
-        """The values from before the time loop that are read in it or after it, leaves included."""
-        # the carries that the backward pass reads must be first and contiguous
-        names = [f"c{i}" for i in (*back.history, *(i for i in kept if i not in back.history))]
-        groups = {"k": self.crossing, "a": back.step, "t": back.totals, "o": back.tables}
-        names += [f"{prefix}{i}" for prefix, nodes in groups.items() for i in nodes]
-        self.marks = ["big"] * any(n.op in ("sin", "cos") for n in self.nodes) + ["wild"] * (wrt == "theta")
-        self.slots = {name: f"lane[{i * LANES} + l]" for i, name in enumerate([*names, *self.marks])}
-        """Each per-lane value that is stored between loops over lanes, by name."""
-        tables = [loop.indices[table] for table in back.tables]
-        self.covers = len(tables) == 1 and np.array_equal(np.sort(tables[0]), np.arange(rows))
-        """Whether every entry of the result is written by exactly one step."""
-        self.adds = bool(wrt) and not self.covers
+        return {i: n for i, n in early.items() if i in read}
+
+    def _slot_names(self) -> list[str]:
+        """Return the names of all slots in order: the carries that the backward pass reads are first and contiguous."""
+        back = self.back
+        carries = dict.fromkeys([*back.history, *self.forward])
+        groups = {"c": carries, "k": self.crossing, "a": back.step, "t": back.totals, "o": back.tables}
+        return [*(f"{letter}{i}" for letter, numbers in groups.items() for i in numbers), *self.marks]
 
     def _needed(self, roots: Iterable[Node], carries: Iterable[int] = ()) -> list[int]:
         """Return the numbers of the carries on which ``roots`` (after the loop) and ``carries`` depend."""
-
-        def more(found: set[int]) -> set[int]:
-            return {node.data for node in reached([self.loop.step[i] for i in found]) if node.op == "carry"}
-
-        return sorted(closure({node.data for node in reached(roots) if node.op == "final"} | set(carries), more))
+        after = {node.data for node in reached(roots) if node.op == "final"}
+        step = self.loop.step
+        return sorted(
+            closure(
+                after | set(carries),
+                lambda found: {node.data for node in reached([step[i] for i in found]) if node.op == "carry"},
+            )
+        )
 
     # --------------------------------------------------------------------------------------------- the loops
 
     def lines(self) -> list[str]:
         """Return the lines of the kernel's body."""
-        back, slots, width = self.back, self.slots, len(self.back.history) * LANES
-        uniforms = self._uniforms()
-        body = ["theta_at = b * theta_column", "scored_at = b * scored_column"]
-        if self.adds:  # the backward pass adds to the result
-            body += _block("for i in range(rows):", _block(LANE, ["out[at(i * out_row + b + l)] = F(0.0)"]))
-        # before the loop over time
-        body += _block(LANE, [f"{slots[name]} = F(0.0)" for name in (*(f"t{i}" for i in back.totals), *self.marks)])
-        body += self._pass(self.uniform_names, self._stores("c", self.starts) + self._stores("k", self.crossing), {})
-        known = {i: slots[f"k{i}"] for i in self.crossing}
-        # separate loops: with more arrays in one loop the compiler cannot prove that none overlap
-        past = [
-            f"past = (horizon - 1 - t) * {width}",
-            *_block(f"for l in range({width}):", ["kept[at(past + l)] = lane[l]"]),
+        uniforms, value = self._uniforms(), [("out[at(b + l)] = {}", self.loop.result)]
+        block = [
+            "theta_at = b * theta_column",
+            "scored_at = b * scored_column",
+            "noise_at = b",
+            *self._cleared(),
+            *self._pass(self._stores("c", self.starts) + self._stores("k", self.crossing), {}),
+            *self._forward_loop(),
+            *self._pass(self._stores("a", self.back.seeds) if self.wrt else value, self.finals),
+            *self._backward_loop(),
+            *self._ends(),
+            *self._flag("big", "LIMIT", "small"),
+            *self._flag("wild", "0.0", "tame"),
         ]
-        inside, names = self._at_step(self.forward.values())
-        inside += self._pass(names, self._stores("c", self.forward), self._leaves("carry", "c", self.forward) | known)
-        if self.forward:
-            body += _block("for t in range(horizon):", past * bool(width) + inside)
-        finals = self._leaves("final", "c", self.forward) | known
-        if not self.wrt:
-            body += self._pass(self.uniform_names, [("out[at(b + l)] = {}", self.result)], finals)
-        body += self._pass(self.uniform_names, self._stores("a", back.seeds), finals)
-        # the history is stored in reading order, since loops over decreasing addresses are not vectorised
-        loads = known | self._leaves("adjoint", "a", back.step)
-        for j, i in enumerate(back.history):
-            loads[self.graph.leaf("carry", i).number] = f"kept[at(back * {width} + {j * LANES} + l)]"
-        stores = self._stores("a", back.step) + self._stores("t", back.totals, "+=") + self._stores("o", back.tables)
-        inside, names = self._at_step(back.inside())
-        inside += [f"o{table} = index[{table} * horizon + t] * out_row + b" for table in back.tables]
-        inside += self._pass(names, stores, loads)
-        for table in back.tables:
-            written = self._written(f"o{table} + l", "+=" if self.adds else "=")
-            inside += _block(LANE, written.format(slots[f"o{table}"]).splitlines())
-        if stores:
-            body += _block("for back in range(horizon):", ["t = horizon - 1 - back", *inside])
-        loads = finals | self._leaves("before", "a", back.step) | self._leaves("total", "t", back.totals)
-        stores = [(self._written(f"{i} * out_row + b + l", "+="), node) for i, node in back.ends.items()]
-        body += self._pass(self.uniform_names, stores, loads)
-        for mark, most, name in (("big", "LIMIT", "small"), ("wild", "0.0", "tame")):
-            if mark in slots:
-                body += _block(LANE, _block(f"if {slots[mark]} > F({most}):", [f"{name} = False"]))
         return [
             *uniforms,
-            f"lane = np.empty({max(len(slots), 1) * LANES}, F)",
-            *[f"kept = np.empty(horizon * {width}, F)"] * bool(width),
+            f"lane = np.empty({max(len(self.slots), 1) * LANES}, F)",
+            *[f"kept = np.empty(horizon * {self.width}, F)"] * bool(self.width),
             "small = tame = True",
-            *_block(f"for b in range(start, stop, {LANES}):", body),
+            *_block(f"for b in range(start, stop, {LANES}):", block),
             "return small, tame",
         ]
 
-    def _leaves(self, op: str, prefix: str, known: Iterable[int]) -> dict[int, str]:
-        """Return the slots from which leaves of a kind are read, by the numbers of their nodes."""
-        return {self.graph.leaf(op, i).number: self.slots[f"{prefix}{i}"] for i in known}
+    def _cleared(self) -> list[str]:
+        """Return the lines that set to 0 what is added to: the result, totals and marks."""
+        result = _block("for i in range(rows):", _block(LANE, ["out[at(i * out_row + b + l)] = F(0.0)"]))
+        names = [*(f"t{i}" for i in self.back.totals), *self.marks]
+        return result * self.adds + _block(LANE, [f"{self.slots[name]} = F(0.0)" for name in names])
 
-    def _stores(self, prefix: str, nodes: dict[int, Node], write: str = "=") -> list[tuple[str, Node]]:
+    def _forward_loop(self) -> list[str]:
+        # a loop of its own: with more arrays in one loop the compiler cannot prove that none overlap. The last step is
+        # first in the history, since loops over decreasing addresses, as the backward pass would be, are not vectorised
+        history = [
+            f"past = (horizon - 1 - t) * {self.width}",
+            *_block(f"for l in range({self.width}):", ["kept[at(past + l)] = lane[l]"]),
+        ]
+        lines, names = self._at_step(self.forward.values())
+        loads = self._leaves("carry", "c", self.forward) | self.known
+        lines += self._pass(self._stores("c", self.forward), loads, names)
+        return _block("for t in range(horizon):", history * bool(self.width) + lines)
+
+    def _backward_loop(self) -> list[str]:
+        back = self.back
+        stores = self._stores("a", back.step) + self._stores("t", back.totals, "+=") + self._stores("o", back.tables)
+        if not stores:
+            return []
+        loads = self.known | self._leaves("adjoint", "a", back.step)
+        for j, i in enumerate(back.history):
+            loads[self.graph.leaf("carry", i).number] = f"kept[at(back * {self.width} + {j * LANES} + l)]"
+        lines, names = self._at_step(back.inside())
+        lines += [f"o{table} = index[{table} * horizon + t] * out_row + b" for table in back.tables]
+        lines += self._pass(stores, loads, names)
+        for table in back.tables:
+            written = self._written(f"o{table} + l", "+=" if self.adds else "=")
+            lines += _block(LANE, written.format(self.slots[f"o{table}"]).splitlines())
+        return _block("for back in range(horizon):", ["t = horizon - 1 - back", *lines])
+
+    def _ends(self) -> list[str]:
+        """Return the lines that add to the result what is known after the backward loop only."""
+        back = self.back
+        loads = self.finals | self._leaves("before", "a", back.step) | self._leaves("total", "t", back.totals)
+        stores = [(self._written(f"{i} * out_row + b + l", "+="), node) for i, node in back.ends.items()]
+        return self._pass(stores, loads)
+
+    def _flag(self, mark: str, most: str, flag: str) -> list[str]:
+        """Return the lines that clear a flag, which the kernel returns, if a lane's mark is above ``most``."""
+        lines = [f"if {self.slots[mark]} > F({most}):", f"    {flag} = False"] if mark in self.marks else []
+        return _block(LANE, lines)
+
+    def _leaves(self, op: str, letter: str, numbers: Iterable[int]) -> dict[int, str]:
+        """Return the slots from which leaves of a kind are read, by the numbers of their nodes."""
+        return {self.graph.leaf(op, i).number: self.slots[f"{letter}{i}"] for i in numbers}
+
+    def _stores(self, letter: str, nodes: dict[int, Node], write: str = "=") -> list[tuple[str, Node]]:
         """Return nodes with the statements that write or add ``{}`` to their slots."""
-        return [(f"{self.slots[f'{prefix}{i}']} {write} {{}}", node) for i, node in nodes.items()]
+        return [(f"{self.slots[f'{letter}{i}']} {write} {{}}", node) for i, node in nodes.items()]
 
     def _written(self, place: str, write: str) -> str:
         """Return statements that write or add ``{}`` to the result and, for derivatives by theta, flag large ones."""
@@ -194,16 +243,20 @@ class _Kernel:
         for node in reached(roots):
             if node.op in LOOKUPS:
                 name = node.op[:-1]
-                at = "b" if name == "noise" else f"{name}_at"
-                lines.append(f"{name}{node.data} = index[{node.data} * horizon + t] * {name}_row + {at}")
+                lines.append(f"{name}{node.data} = index[{node.data} * horizon + t] * {name}_row + {name}_at")
             elif node.number in self.timed - self.wide:
                 lines.append(f"s{node.number} = {self._formula(node, names)}")
                 names[node.number] = f"s{node.number}"
         return lines, names
 
-    def _pass(self, names: dict[int, str], stores: list[tuple[str, Node]], loads: dict[int, str]) -> list[str]:
-        """Return one loop over the lanes: read ``loads``, compute, and store each node by the statements with ``{}`` for it."""
-        names, lines = dict(names), []
+    def _pass(
+        self, stores: list[tuple[str, Node]], loads: dict[int, str], known: dict[int, str] | None = None
+    ) -> list[str]:
+        """Return one loop over the lanes: read ``loads``, compute, and store each node by the statements with ``{}`` for it.
+
+        ``known`` are the variables that already have values, by default those of uniform values.
+        """
+        names, lines = dict(known or self.uniform_names), []
         for node in reached([node for _, node in stores], lambda n: n.number in loads or n.number in names):
             if node.number not in names:
                 lines.append(f"v{node.number} = {loads.get(node.number) or self._formula(node, names)}")
@@ -260,8 +313,7 @@ INFIX = {
 FORMULAS = {
     "parameter": "parameter[{data}]",
     "table": "constant[{data} * horizon + t]",
-    "noise": "noise[at({data} * noise_row + b + l)]",
-    **{name: f"{name}[at({{data}} * {name}_row + {name}_at + l)]" for name in ("theta", "scored")},
+    **{name: f"{name}[at({{data}} * {name}_row + {name}_at + l)]" for name in ("theta", "scored", "noise")},
     **{op: f"{op[:-1]}[at({op[:-1]}{{data}} + l)]" for op in LOOKUPS},
     **{op: f"{{}} {sign} {{}}" for op, sign in INFIX.items()},
     "neg": "-{}",

@@ -12,22 +12,19 @@ import math
 LIMIT = 1.6e6
 """Maximum angle [rad] of the fast sine and cosine."""
 
-
-HALF_PI = (1.5707963267341256, 6.077100506303966e-11, 2.0222662487959506e-21)
+P1, P2, P3 = 1.5707963267341256, 6.077100506303966e-11, 2.0222662487959506e-21
 """Three floats that add up to pi / 2, the first two with 33 bits each."""
 
 
 def _series(first: int, last: int) -> str:
     """Return source for the sum of (-1)^i z^i / n! over n = first, first + 2, ..., last, in Horner's form, z = r^2."""
-    orders = list(range(first, last + 1, 2))
     text = ""
-    for i, order in reversed(list(enumerate(orders))):
+    for i, order in reversed([*enumerate(range(first, last + 1, 2))]):
         term = f"F({(-1) ** i / math.factorial(order)!r})"
         text = f"({term} + z * {text})" if text else term
     return text
 
 
-P1, P2, P3 = HALF_PI
 FAST = f"""
 LIMIT = {LIMIT!r}
 

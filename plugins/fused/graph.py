@@ -16,7 +16,8 @@ MOST = 20_000
 TRACED = 25 * MOST
 """Maximum number of nodes of a trace, in which inputs of each step, such as controls, become one in the code of the loop."""
 
-
+NEUTRAL = {"add": 0.0, "sub": 0.0, "mul": 1.0, "div": 1.0}
+"""Second arguments that change nothing, and first ones of sums and products."""
 TOO_LONG = f"code of more than {MOST} operations without a loop"
 
 
@@ -71,19 +72,16 @@ class Graph:
         return self._simpler(op, args, values) or self._node(op, args, data)
 
     def _simpler(self, op: str, args: tuple[Node, ...], values: list[Any]) -> Node | None:
-        if op == "stop_gradient":
-            # remains a separate operation, since its derivative is 0
-            return None
+        # ``stop_gradient`` remains a separate operation, since its derivative is 0
+        neutral = NEUTRAL.get(op)
+        if neutral is not None and values[1] == neutral:
+            return args[0]
         if op in ("add", "mul"):
-            neutral = 0.0 if op == "add" else 1.0
-            for value, other in zip(values, reversed(args), strict=True):
-                if value == neutral:
-                    return other
+            if values[0] == neutral:
+                return args[1]
             # constants last, so that formulas of different steps have the same form; else in the order first used
             if args[0].op == "literal" or (op, (args[1].number, args[0].number), None) in self._known:
                 return self._node(op, (args[1], args[0]), None)
-        if op in ("sub", "div") and values[1] == (0.0 if op == "sub" else 1.0):
-            return args[0]
         if op == "sub" and values[0] == 0.0:
             return self.apply("neg", args[1])
         if op == "mul" and -1.0 in values:

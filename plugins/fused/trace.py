@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ class Loop:
     """The carries before the first step."""
     step: list[Node] = field(default_factory=list)
     """The carries after a step, as functions of the ``carry`` leaves."""
-    result: Node | None = None
+    result: Node = field(init=False)
     constants: list[np.ndarray] = field(default_factory=list)
     """Tables ``(length,)`` of constants."""
     indices: list[np.ndarray] = field(default_factory=list)
@@ -39,9 +40,9 @@ class Loop:
 
 
 def traced(function: Callable[..., Any], shapes: dict[str, int]) -> Loop:
-    """Return the scalar form of ``function(**columns)``, which must return one number per column.
+    """Return the scalar form of ``function(*columns)``, which must return one number per column.
 
-    ``shapes`` maps each argument to its length n. Arguments have shape ``(n, 1)``, except ``parameter (n,)``. The
+    ``shapes`` maps each argument, in order, to its length n. Arguments have shape ``(n, 1)``, except ``parameter (n,)``. The
     function may contain one scan. Raises :class:`Refused` with the name of a primitive without a scalar form.
     """
     import jax
@@ -49,21 +50,17 @@ def traced(function: Callable[..., Any], shapes: dict[str, int]) -> Loop:
     arguments = [
         jax.ShapeDtypeStruct((n,) if name == "parameter" else (n, 1), np.float64) for name, n in shapes.items()
     ]
-    closed = jax.make_jaxpr(lambda *columns: function(**dict(zip(shapes, columns, strict=True))))(*arguments)
+    closed = jax.make_jaxpr(function)(*arguments)
     tracer = Tracer(Graph())
-    inputs = [_leaves(tracer.loop.graph, name, n) for name, n in shapes.items()]
-    (cost,) = tracer.run(closed.jaxpr, closed.consts, inputs)
     loop, graph = tracer.loop, tracer.loop.graph
+    leaves = ([graph.leaf(name, i) for i in range(n)] for name, n in shapes.items())
+    inputs = [_objects(items, argument.shape) for items, argument in zip(leaves, arguments, strict=True)]
+    (cost,) = tracer.run(closed.jaxpr, closed.consts, inputs)
     loop.result = tracer.nodes(cost)[0]
     if len(reached([*loop.first, *loop.step, loop.result])) > MOST:
         raise Refused(TOO_LONG)
     graph.most = len(graph.nodes) + MOST
     return loop
-
-
-def _leaves(graph: Graph, name: str, count: int) -> np.ndarray:
-    leaves = _objects([graph.leaf(name, i) for i in range(count)], (count,))
-    return leaves if name == "parameter" else leaves[:, None]
 
 
 def _objects(items: Sequence[Any], shape: tuple[int, ...]) -> np.ndarray:
@@ -103,7 +100,7 @@ class Tracer:
 
     def _apply(self, equation: Any, given: list[Any]) -> list[np.ndarray]:
         name, parameters, values = equation.primitive.name, equation.params, [*map(np.asarray, given)]
-        if name in ("jit", "pjit"):
+        if name == "jit":
             return self.run(parameters["jaxpr"].jaxpr, parameters["jaxpr"].consts, values)
         if name == "scan":
             return self._scan(parameters, values)
@@ -150,10 +147,7 @@ class Tracer:
     def _reduce(self, op: str, value: np.ndarray, axes: Sequence[int]) -> np.ndarray:
         moved = np.moveaxis(value, axes, range(len(axes)))
         rows = moved.reshape(-1, *moved.shape[len(axes) :])
-        total: np.ndarray = rows[0]
-        for row in rows[1:]:
-            total = self._each(op, (total, row), row.shape)
-        return total
+        return reduce(lambda total, row: self._each(op, (total, row), row.shape), rows)
 
     def _dot(self, dimensions: Any, left: np.ndarray, right: np.ndarray) -> np.ndarray:
         (over_left, over_right), (batch, _) = dimensions
@@ -220,17 +214,15 @@ class Tracer:
         # maximum number of different formulas for one input of a step along the horizon
         if len(distinct) > 4:
             raise Refused("scan over inputs of too many different forms")
-        graph, result = self.loop.graph, None
-        for kind in distinct:
+        graph, result = self.loop.graph, nodes[0]
+        for i, kind in enumerate(distinct):
             mask = np.array([other == kind for other in kinds])
             sample = nodes[int(np.argmax(mask))]
             formula = self._along([node if here else sample for node, here in zip(nodes, mask, strict=True)])
-            if result is None:
-                result = formula
-                continue
-            table = graph.leaf("table", self._table(self.loop.constants, mask.astype(float)))
-            result = graph.apply("select_n", graph.apply("gt", table, graph.literal(0.5)), result, formula)
-        assert result is not None
+            if i:
+                table = graph.leaf("table", self._table(self.loop.constants, mask.astype(float)))
+                formula = graph.apply("select_n", graph.apply("gt", table, graph.literal(0.5)), result, formula)
+            result = formula
         return result
 
     def _table(self, tables: list[np.ndarray], values: np.ndarray) -> int:
