@@ -91,7 +91,9 @@ class _Kernel:
         self.back = back = backward(loop, self._needed([loop.result]), wrt) if wrt else Backward()
         after = [*back.seeds.values(), *back.ends.values()] if wrt else [loop.result]
         # a derivative may need fewer carries than the value: for example, it does not read the accumulated cost
-        carries = self._needed([*after, *(loop.step[i] for i in back.history)], back.history)
+        needed = self._needed([*after, *(loop.step[i] for i in back.history)], back.history)
+        # the carries that the backward pass reads are first and contiguous
+        carries = dict.fromkeys([*back.history, *needed])
         self.forward, self.starts = ({i: part[i] for i in carries} for part in (loop.step, loop.first))
         inside = [*self.forward.values(), *back.inside()]
         self.nodes = reached([*self.starts.values(), *inside, *after])
@@ -119,20 +121,18 @@ class _Kernel:
         return {i: n for i, n in early.items() if i in read}
 
     def _slot_names(self) -> list[str]:
-        """Return the names of all slots in order: the carries that the backward pass reads are first and contiguous."""
+        """Return the names of all slots in order."""
         back = self.back
-        carries = dict.fromkeys([*back.history, *self.forward])
-        groups = {"c": carries, "k": self.crossing, "a": back.step, "t": back.totals, "o": back.tables}
+        groups = {"c": self.forward, "k": self.crossing, "a": back.step, "t": back.totals, "o": back.tables}
         return [*(f"{letter}{i}" for letter, numbers in groups.items() for i in numbers), *self.marks]
 
     def _needed(self, roots: Iterable[Node], carries: Iterable[int] = ()) -> list[int]:
         """Return the numbers of the carries on which ``roots`` (after the loop) and ``carries`` depend."""
         after = {node.data for node in reached(roots) if node.op == "final"}
-        step = self.loop.step
         return sorted(
             closure(
                 after | set(carries),
-                lambda found: {node.data for node in reached([step[i] for i in found]) if node.op == "carry"},
+                lambda found: {n.data for n in reached([self.loop.step[i] for i in found]) if n.op == "carry"},
             )
         )
 
