@@ -10,8 +10,6 @@ from bench.errors import local_path
 
 __all__ = ["Claim", "Figure", "Outcome", "main"]
 
-OPTIONS = ("--list", "--quick", "--again")
-
 
 def main(words: Sequence[str]) -> int:
     """Run the named claims, or all, and print verdicts. Returns 1 if a claim is not reproduced or its code fails."""
@@ -19,7 +17,8 @@ def main(words: Sequence[str]) -> int:
     from bench.experiment.words import parse_words
     from bench.run.files import make_directory
 
-    names, settings, options = parse_words(words, "claims", {"results_dir": "results"}, OPTIONS)
+    known = {"results_dir": "results"}
+    names, settings, options = parse_words(words, "claims", known, ("--list", "--quick", "--again"))
     claims = discovery.claims()
     selected = discovery.select(claims, names, "--quick" in options)
     if "--list" in options:

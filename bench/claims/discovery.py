@@ -9,8 +9,6 @@ from bench.claims.claim import Claim
 from bench.errors import printable, unknown
 from bench.model import registry
 
-REQUIRED = ("lesson", "statement", "source", "learned")
-"""Strings that every claim defines."""
 LESSONS = {
     "Low variance is not low bias": "The spread of a gradient says nothing about its distance from the truth.",
     "Which variance is smaller": "Roughness costs the first order, dimension the zeroth.",
@@ -33,7 +31,8 @@ def claims() -> dict[str, type[Claim]]:
     complete: list[type[Claim]] = []
     for entry in entries:
         if entry.plugin is not None and issubclass(entry.plugin, Claim):
-            missing = [name for name in REQUIRED if not isinstance(getattr(entry.plugin, name, None), str)]
+            required = ("lesson", "statement", "source", "learned")
+            missing = [name for name in required if not isinstance(getattr(entry.plugin, name, None), str)]
             if missing:
                 print(f"bench: claim '{entry.name}' does not define {', '.join(missing)}", file=sys.stderr)
             else:

@@ -18,15 +18,10 @@ from bench.errors import UserError, local_path
 from bench.experiment.columns import Column, setting, text
 from bench.experiment.views import Chart, Mark, Table, Views
 from bench.experiment.words import parse_words
+from bench.report.views import attempted
 from bench.run.files import make_directory, write_all
 
-CHANGED = 1.01
-"""Smallest factor by which an error counts as changed."""
 ERROR = Column("error", label="relative error", digits=3)
-ERRORS = ("paired", "interval", "exact")
-"""Comparison rules of columns that contain an error. An experiment is followed by the first such column with a value."""
-NOT_RUN = ("unsupported", "unavailable", "waiting")
-"""Statuses of cells that never ran, which do not count as failures."""
 QUESTION = "Which series changed?"
 NOTES = (
     "error: geometric mean of the ratios to the errors of the first result, over the cells that are ok in all results. Below "
@@ -69,11 +64,14 @@ def compute_history(names: Sequence[str], results: Sequence[Mapping[str, Results
         tables = [table.reindex(first.index) for table in tables]
         is_ok = pd.concat([table["status"] == "ok" for table in tables], axis=1, keys=range(len(tables)))
         by = "estimator" if first["estimator"].any() else "backend"
-        errors = [column for by in ERRORS for column in compared if rule_of(column).by == by]
+        # an experiment is followed by the first column of an error that has a value
+        rules = ("paired", "interval", "exact")
+        errors = [column for rule in rules for column in compared if rule_of(column).by == rule]
         error = next((column for column in errors if (first[column.name] > 0).any()), None)
         vectors = [column for column in compared if rule_of(column).by == "vector"]
         for series, every in first.groupby(by, sort=False):
-            of = every.index[~every["status"].isin(NOT_RUN)]
+            # cells that never ran are no failures
+            of = attempted(every).index
             same = of[is_ok.loc[of].all(axis=1)]
             before = first.loc[same]
             for place, (name, table) in enumerate(zip(names, tables, strict=True)):
@@ -164,7 +162,7 @@ def views(history: History) -> Views:
 def _is_changed(part: pd.DataFrame) -> bool:
     """Return whether an error of a series moved by 1%, or its failures or gradients changed."""
     error = part["error"].max() / part["error"].min()
-    return bool(error > CHANGED or part["failed"].nunique() > 1 or (part["moved"] > ROUNDING).any())
+    return bool(error > 1.01 or part["failed"].nunique() > 1 or (part["moved"] > ROUNDING).any())
 
 
 def _short_names(names: Sequence[str]) -> dict[str, str]:

@@ -33,8 +33,6 @@ PAIRED = 1.01
 """Smallest ratio at which an error measured with the same noise counts as worse or better, not only as changed."""
 ROUNDING = 1e-6
 """Relative change that rounding on another machine may cause over a long rollout."""
-SIGMAS = 4.0
-"""Distance of two references, in standard errors, above which the reference itself changed."""
 NOTES = (
     "Both sides have the same seeds and noise, so unchanged code gives the same estimates. A mean estimate or a variance "
     f"that moved by more than {ROUNDING:g} shows that the code changed. The cell is worse or better if the RMSE about the "
@@ -66,59 +64,53 @@ class Change(NamedTuple):
 
 def judge_cell(columns: Columns, old: Row | None, new: Row | None) -> list[Change]:
     """Return the changes of a cell in its status and in its judged columns, except times; either row may be missing."""
-    if old is None:
-        return [Change("changed", "new", "new")]
-    if new is None:
-        return [Change("worse" if old["status"] == "ok" else "changed", f"gone, it was {old['status']}", "gone")]
-    if old["status"] != new["status"]:
-        outcome = "worse" if old["status"] == "ok" else "better" if new["status"] == "ok" else "changed"
-        reason = f" ({_remark(new)})" if _remark(new) else ""
-        return [Change(outcome, f"status {old['status']} to {new['status']}{reason}", "no longer ok")]
-    if old["status"] != "ok":
+    was, now = ("" if row is None else row["status"] for row in (old, new))
+    if old is None or new is None or was != now:
+        return [_whole(was, now, _remark(new))]
+    if was != "ok":
         return []
-    judged = columns.compared
-    pair = next((_pair(rule_of(column), old, new) for column in judged if rule_of(column).by == "paired"), None)
     # of equal estimates only the reference can differ, which makes them neither better nor worse
-    are_same = pair is not None and pair.is_same
-    lost = [name for name in _watched(columns) if _n_values(new, name) < _n_values(old, name)]
-    changes = [Change("worse", f"no value any more: {', '.join(lost)}", "no value")] if lost else []
-    for column in judged:
+    pairs = (_pair(rule_of(column), old, new) for column in columns.compared)
+    are_same, doubt = any(pair and pair.is_same for pair in pairs), _doubt(old, new)
+    changes = _lost(columns, old, new)
+    for column in columns.compared:
         rule = rule_of(column)
         is_estimated = rule.by in ("interval", "spread")
-        if rule.by == "time" or (is_estimated and are_same):
-            continue
-        if rule.by == "paired":
-            change = _paired(column, pair, old, new) if pair else None
-        else:
-            change = RULES[rule.by](column, old, new)
-        if change is None:
-            continue
-        change = change._replace(subject=rule.called, outcome="changed" if rule.neutral else change.outcome)
-        remarks = [
-            text for row in (old, new) for text in _remark(row).split("; ") if text and not text.startswith(PHYSICS)
-        ]
-        if is_estimated and remarks:
-            doubt = UNEXPLAINED if any(map(is_unexplained, remarks)) else "intervals doubtful"
-            change = change._replace(outcome="changed", text=f"{change.text}, {doubt}")
-        changes.append(change)
+        change = None if is_estimated and are_same else RULES[rule.by](column, old, new)
+        if change:
+            outcome = "changed" if rule.neutral or (is_estimated and doubt) else change.outcome
+            changes.append(Change(outcome, change.text + doubt * is_estimated, rule.called))
     return changes
 
 
-def _watched(columns: Columns) -> list[str]:
-    """Return the columns whose values must not be lost: those that rules use or, in a study without rules, all numbers."""
+def _whole(was: str, now: str, reason: str) -> Change:
+    """Return the change of a cell that is new, gone or of another status."""
+    outcome = "worse" if was == "ok" else "better" if was and now == "ok" else "changed"
+    if not was:
+        return Change(outcome, "new", "new")
+    if not now:
+        return Change(outcome, f"gone, it was {was}", "gone")
+    return Change(outcome, f"status {was} to {now}" + f" ({reason})" * bool(reason), "no longer ok")
+
+
+def _doubt(old: Row, new: Row) -> str:
+    """Return what the remarks of both rows say against their intervals; empty if nothing."""
+    remarks = [text for row in (old, new) for text in _remark(row).split("; ") if text and not text.startswith(PHYSICS)]
+    doubt = f", {UNEXPLAINED}" if any(map(is_unexplained, remarks)) else ", intervals doubtful"
+    return doubt * bool(remarks)
+
+
+def _lost(columns: Columns, old: Row, new: Row) -> list[Change]:
+    """Return a change if values are lost that rules use or, in a study without rules, any numbers."""
     judged = [column for column in columns.compared if not column.measured]
-    rules = [(column, rule_of(column)) for column in judged]
-    used = [
+    names = [
         name
-        for column, rule in rules
+        for column in judged
+        for rule in (rule_of(column),)
         for name in (column.name, *_ends(column), rule.mean, rule.variance, rule.reference)
-    ]
-    own = [
-        column.name
-        for column in columns.all
-        if column.kind == "number" and not column.measured and column.name not in COMMON
-    ]
-    return [*dict.fromkeys(used)] if judged else own
+    ] or [c.name for c in columns.all if c.kind == "number" and not c.measured and c.name not in COMMON]
+    lost = [name for name in dict.fromkeys(names) if _n_values(new, name) < _n_values(old, name)]
+    return [Change("worse", f"no value any more: {', '.join(lost)}", "no value")] if lost else []
 
 
 def _n_values(row: Row, name: str) -> int:
@@ -134,9 +126,10 @@ def _ends(column: Column) -> tuple[str, str]:
     return column.low or f"{column.name}_low", column.high or f"{column.name}_high"
 
 
-def _remark(row: Row) -> str:
+def _remark(row: Row | None) -> str:
     """Return the reason of a row; empty if there is none."""
-    return row["reason"] if isinstance(row.get("reason"), str) else ""
+    reason = row.get("reason") if row is not None else ""
+    return reason if isinstance(reason, str) else ""
 
 
 class _Pair(NamedTuple):
@@ -173,9 +166,12 @@ def _pair(rule: ComparisonRule, old: Row, new: Row) -> _Pair | None:
     return _Pair(means, variances, references, scale)
 
 
-def _paired(column: Column, pair: _Pair, old: Row, new: Row) -> Change | None:
+def _paired(column: Column, old: Row, new: Row) -> Change | None:
     """Judge an error by the mean estimates on the same noise."""
     rule = rule_of(column)
+    pair = _pair(rule, old, new)
+    if pair is None:
+        return None
     if pair.is_same:
         stem = rule.reference.partition("_")[0]  # of reference_gradient: its standard error is reference_se
         return _reference_change(pair, [value(row, f"{stem}_se") for row in (old, new)])
@@ -198,7 +194,8 @@ def _reference_change(pair: _Pair, errors: list[float]) -> Change | None:
     old, new = pair.references
     if new.shape != old.shape or not np.isfinite(new).all():
         return None
-    tolerance = SIGMAS * math.hypot(*(error if error > 0 else 0.0 for error in errors))
+    # four standard errors
+    tolerance = 4.0 * math.hypot(*(error if error > 0 else 0.0 for error in errors))
     distance = float(np.linalg.norm(new - old))
     if distance <= tolerance + ROUNDING * float(np.linalg.norm(old)):
         return None
@@ -260,11 +257,13 @@ def _verdict(column: Column, old: Row, new: Row) -> Change | None:
 
 
 RULES: dict[str, Callable[[Column, Row, Row], Change | None]] = {
+    "paired": _paired,
     "interval": _size,
     "spread": _size,
     "exact": _size,
     "vector": _vector,
     "verdict": _verdict,
+    "time": lambda *_: None,  # see bench.compare.timings
 }
 
 

@@ -22,8 +22,6 @@ SINGLE = 2 * 2.0**-24 * math.sqrt(288)
 """Relative rounding error of position and velocity over 288 steps in single precision, as in the published ends of C10."""
 FITTED = 1e4
 """The penalty stiffness of C11 whose descent ends where the source's descent ends [N/m]."""
-TRIED = (1e2, 1e3, 3e3, FITTED, 3e4, 1e5)
-"""All stiffnesses tested for C11 [N/m]."""
 STEPS, OPTIMUM = 480, 0.311417
 SHARE = 0.03
 """Relative difference allowed between the ends of C12: the source's programs are not described to the last operation."""
@@ -91,7 +89,7 @@ class Collision(Claim):
             Figure(f"cost at the end, {label.partition(' ')[0]}", loss, float(series[label][-1]))
             for label, loss in zip(LAWS, ("1.395808", "2.001432", "1.6694"), strict=True)
         ]
-        tried = {k: float(_costs(f"penalty[stiffness={k!r}]")[-1]) for k in TRIED}
+        tried = {k: float(_costs(f"penalty[stiffness={k!r}]")[-1]) for k in (1e2, 1e3, 3e3, FITTED, 3e4, 1e5)}
         ends = ", ".join(f"{end:.4f} at {k:g}" for k, end in tried.items())
         last = series["penalty"][-5:]
         return Outcome(

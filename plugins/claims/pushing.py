@@ -15,8 +15,6 @@ from bench.model import Problem
 SMOOTHED, COARSE, FINE = 20_000, 20_000, 4096
 """Samples of each variance."""
 CURVES = ("first order, step 5 ms", "step 0.25 ms, first order", "zeroth order")
-TAILS = 0.25
-"""Relative error of a variance of 1,000 samples above which a few samples dominate it."""
 
 
 def sampled(at: Problem, count: int, seed: int, batches: int = 20) -> Iterator[tuple[float, float]]:
@@ -132,6 +130,7 @@ def _by_order(name: str, places: Iterable[Any], curves: Sequence[str], variances
 def _heavy(what: str, text: str, values: tuple[float, float], count: int) -> Figure:
     """Return a figure that is compared by the errors of both sides, or by a factor if heavy tails dominate the error."""
     measured, error = values
-    if error * math.sqrt(count / 1000) < TAILS * measured:
+    # above this relative error of the variance of 1,000 samples, a few of them dominate it
+    if error * math.sqrt(count / 1000) < 0.25 * measured:
         return Figure(what, text, measured, error, spread=source_error(values, count))
     return Figure(what, text, measured, error, factor=10.0)

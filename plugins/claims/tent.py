@@ -11,9 +11,6 @@ from bench.claims.toolkit import estimator, function, problem, spread, terms
 from bench.model import Array, FunctionScene
 
 SAMPLES = 400_000
-AT_GAIN = 8 * SAMPLES
-"""Number of samples at T = 20, where the source states the gain with two digits."""
-
 WEIGHED, MIXED = 2, 40_000
 """Steps at which the variance of the estimator ``inverse_variance`` is measured, and the number of its estimates."""
 
@@ -52,7 +49,8 @@ class Chaos(Claim):
         figures, horizons, variances = [], [1, 2, 5, 10, 14, 20], []
         for steps in horizons:
             at = problem(tent(steps))
-            w = draw.standard_normal((1, AT_GAIN if steps == 20 else SAMPLES))
+            # at T = 20 the source states the gain with two digits
+            w = draw.standard_normal((1, 8 * SAMPLES if steps == 20 else SAMPLES))
             gradients = terms(at, first, w)
             (v1, e1), (v0, e0) = spread(gradients), spread(terms(at, zeroth, w))
             variances.append([(v1, e1), (v0, e0)])

@@ -122,8 +122,9 @@ class OtherObjective(Claim):
         )
 
 
-def _ilqr(effort: float, terminal: float, iterations: int, dt: float = 0.05, horizon: int = 200) -> list[float]:
+def _ilqr(effort: float, terminal: float, iterations: int) -> list[float]:
     """Return the costs, with weights 1 and 1, of full-step iLQR iterates that minimise the cost with other weights."""
+    dt, horizon = 0.05, 200
     scene = f"pendulum_swing[horizon={horizon},dt={dt!r},effort={{}},terminal={{}}]"
     given, scored = problem(scene.format(effort, terminal)), problem(scene.format(1.0, 1.0))
     still = np.zeros((horizon, 1))
