@@ -134,7 +134,7 @@ class Table:
     details: Sequence[str] = ()
     """Columns for readers that the terminal omits."""
     page: bool = False
-    """Whether the page shows the table, above the charts."""
+    """Whether the page shows the table, above the charts, if no table before has this too."""
     split: str = ""
     """The column that divides the table for readers into parts with a heading each."""
     data: pd.DataFrame | None = None

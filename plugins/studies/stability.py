@@ -43,7 +43,6 @@ NEUTRAL = 1 + 1e-9
 """Spectral radius, theoretical or measured, up to which a step counts as stable: 1 plus rounding."""
 STIFFNESSES = np.logspace(-3, 4, 141)
 """Values of dt^2 stiffness that the search for the stability limit tries."""
-WORST_FIRST = ("nonfinite", "diverged", "wrong_sign", "zero", "inaccurate", "unresolved", "ok")
 GRADES = {1e-3: "#08519c", 1e-2: "#6baed6", 1e-1: "#d6e6f4", 1.0: "#fdae61", math.inf: "#c51b1b"}
 """Upper ends of the grades of a relative error, and their colours."""
 OTHER = {
@@ -96,7 +95,15 @@ class Stability(StudyPackage):
         Column("grad_norm", "norm of the gradient"),
         Column("truth_norm", "norm of the truth"),
         Column("truth_error", "relative change of the truth on its last refinement"),
-        text("verdict", "ok, or what is wrong", comparison=ComparisonRule("verdict", "verdict", order=WORST_FIRST)),
+        text(
+            "verdict",
+            "ok, or what is wrong",
+            comparison=ComparisonRule(
+                "verdict",
+                "verdict",
+                order=("nonfinite", "diverged", "wrong_sign", "zero", "inaccurate", "unresolved", "ok"),
+            ),
+        ),
         text("truth", "how the truth was computed: physical or refined"),
         text("cause", "of a finite but wrong gradient: step (or how it is differentiated), law, both or unknown"),
         Column(
@@ -140,11 +147,8 @@ class Stability(StudyPackage):
             bad = {"first_bad_step": step, "state_at_first_bad_step": states[step].tolist()}
             return result | bad | {"status": verdict, "verdict": verdict, "reason": reason}
         if not np.isfinite(gradient).all():
-            return (
-                result
-                | dict.fromkeys(("status", "verdict"), "nonfinite")
-                | {"reason": "the gradient of a finite rollout"}
-            )
+            reason = "the gradient of a finite rollout"
+            return result | {"status": "nonfinite", "verdict": "nonfinite", "reason": reason}
         kind, truth, error = compute_truth(cell, self)
         result |= {"truth": kind, "truth_norm": norm(truth), "truth_error": error}
         resolved = self.inaccurate / 2

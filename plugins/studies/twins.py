@@ -29,7 +29,6 @@ FLOOR = 1e-17
 """Smallest difference that is drawn; smaller ones, 0 included, are drawn here as upper limits."""
 PARTED = 1e-6
 """Relative difference of states from which on two engines have parted."""
-DIFFERENCES = ("gradient_difference_rel", "state_difference_rel", "cost_difference_rel")
 SHOWN = (
     "state_difference",
     "state_difference_rel",
@@ -139,7 +138,10 @@ class Twins(StudyPackage):
         chart = Chart(
             "twins",
             frame,
-            [shown.column(name, least=FLOOR, log=True, label=self.columns.by_name[name].doc) for name in DIFFERENCES],
+            [
+                shown.column(name, least=FLOOR, log=True, label=self.columns.by_name[name].doc)
+                for name in ("gradient_difference_rel", "state_difference_rel", "cost_difference_rel")
+            ],
             [text("problem", label="")],
             "dots",
             series="method",

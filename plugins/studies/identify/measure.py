@@ -29,14 +29,10 @@ from .missing import missing_terms
 from .model import Model, model_of, own_record
 from .record import evaluate, expressions
 
-SHOOTING = ("single", "multiple", "windows")
-"""Shooting methods: one rollout, consecutive windows joined by a penalty on gaps, and independent windows."""
 NOISE = 0.01
 """Noise of records that are made from the truth, if none is stated."""
 SHARE = 1e-4
 """Exponents below this are 0."""
-REJECTED = 1e-3
-"""Share of fits to a right model whose residuals are larger than those that count as consistent with the noise."""
 
 
 def prepared(cell: Cell, settings: Identify) -> tuple[Model, np.ndarray | None]:
@@ -69,6 +65,7 @@ def measure(cell: Cell, session: Session, settings: Identify) -> dict[str, Any]:
     is_noise_known = settings.measurement is not None or not is_own
 
     def fit(shooting: str, sigma: float) -> Fit:
+        """Fit by one rollout (``single``), windows joined by a penalty on gaps (``multiple``), or independent ``windows``."""
         fitting = Fitting(model, shooting, 1 if shooting == "single" else n_windows, sigma)
         fitted = run_fits(fitting, optimizer, fitting.start(start, data), data, settings.iterations)
         return Fit(
@@ -78,11 +75,11 @@ def measure(cell: Cell, session: Session, settings: Identify) -> dict[str, Any]:
     sigma = settings.measurement or (float(np.std(data)) or 1.0 if is_own else NOISE)
     if is_own:
         first, free = fit("single", sigma), len(data) - len(theta)
-        if not is_noise_known and free < 1:
-            raise Unsupported(
-                f"{settings.record} has {len(data)} measurements for {len(theta)} unknowns: state the noise, measurement=.."
-            )
         if not is_noise_known:
+            if free < 1:
+                raise Unsupported(
+                    f"{settings.record} has {len(data)} measurements for {len(theta)} unknowns: state the noise, measurement=.."
+                )
             sigma *= norm(first.residual) / math.sqrt(free) or 1.0
         theta = model.theta(first.solution)[:, 0]
         model = model.scaled(theta)
@@ -101,7 +98,7 @@ def measure(cell: Cell, session: Session, settings: Identify) -> dict[str, Any]:
         **step_dependence(cell, model, theta, known, sigma),
         **_estimates(single, known, start[:, 0], expressions(settings.terms)),
     }
-    fits = [single, *(fit(shooting, sigma) for shooting in SHOOTING[1:] if has_windows)]
+    fits = [single, *(fit(shooting, sigma) for shooting in ("multiple", "windows") if has_windows)]
     result |= pd.DataFrame([_fit_statistics(one, known, is_own) for one in fits]).to_dict("list")
     return result
 
@@ -150,22 +147,23 @@ def _estimates(fit: Fit, known: Information, start: np.ndarray, own: Mapping[str
     theta = model.theta(fit.solution[:p, :1])[:, 0]
     intervals = _intervals(fit, known, theta)
     result = _parameters(model, known, intervals, start)
-    # most records whose residuals are tested
-    finite = np.flatnonzero(fit.is_finite)[:64].tolist()
-    if not finite or finite[0]:
+    # the residuals of at most so many records are tested
+    tested = np.flatnonzero(fit.is_finite)[:64].tolist()
+    if 0 not in tested:
         return result
     # the effects of missing terms at one fit serve all records, which have the same truth
     terms = missing_terms(model, theta, fit.fitting.noise, own)
     channels = len(model.measured)
-    verdicts = [
+    first, *others = (
         adequacy.judge(fit.residual[:, i], known.along(fit.slopes(i)), channels, terms, i, fit.is_noise_known)
-        for i in finite
-    ]
-    first = verdicts[0]
+        for i in tested
+    )
+    is_untested = math.isnan(first.probability)
+    free = max(len(fit.residual) - known.rank, 1)
     result |= {
-        "explained": float(np.mean([one.is_explained for one in verdicts])) + 0.0 * first.probability,  # nan: untested
+        "explained": math.nan if is_untested else float(np.mean([one.is_explained for one in (first, *others)])),
         "contradictions": ", ".join(f"{name} ({value:.2g})" for name, value in first.contradictions.items()),
-        "noise_size": fit.fitting.noise * norm(fit.residual[:, 0]) / math.sqrt(max(len(fit.residual) - known.rank, 1)),
+        "noise_size": fit.fitting.noise * norm(fit.residual[:, 0]) / math.sqrt(free),
     }
     return result | _unnoticed(fit, known, intervals, terms, first.reach) if first.reach else result
 
@@ -239,7 +237,8 @@ def _fit_statistics(fit: Fit, known: Information, is_own: bool) -> dict[str, Any
     square = (fit.residual[:measured] ** 2).sum(axis=0)
     # gaps of multiple shooting tie its initial states to the parameters
     free = max(measured - (fit.fitting.dim if shooting == "windows" else p), 1)
-    has_converged = np.isfinite(square) & (square <= chdtri(free, REJECTED))
+    # of the fits to a right model, 0.1% have larger residuals
+    has_converged = np.isfinite(square) & (square <= chdtri(free, 1e-3))
     hidden = sum(
         Information(known.names, fit.slopes(i)).rank > known.rank for i in np.flatnonzero(fit.is_finite).tolist()
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -31,14 +30,18 @@ x is what they act on, q and v are the coordinate that they accelerate, q0, v0, 
 """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Place:
-    """Where an effect may act: a kind of :data:`TERMS`, what it acts on, and the course and the size of that."""
+    """Where an effect may act: a kind of :data:`TERMS`, what it acts on, the course of that, and the largest size."""
 
     kind: str
     of: str
     signal: np.ndarray
     size: float
+
+
+Effects = dict[str, tuple[_Place, np.ndarray]]
+"""Effects by name: the place of each, and its course along the motion."""
 
 
 def _places(model: Model, path: np.ndarray, controls: np.ndarray) -> list[_Place]:
@@ -58,15 +61,15 @@ def _places(model: Model, path: np.ndarray, controls: np.ndarray) -> list[_Place
     ]
 
 
-def _courses(place: _Place, state: Mapping[str, np.ndarray], own: Mapping[str, str]) -> dict[str, Any]:
-    """Return the courses of the effects that may act in a place, by name; ``own`` are further accelerations."""
+def _effects(place: _Place, state: Mapping[str, np.ndarray], own: Mapping[str, str]) -> Effects:
+    """Return the effects that may act in a place along the course of a state; ``own`` are further accelerations."""
     known = {**state, "t": np.linspace(-1.0, 1.0, len(place.signal)), "x": place.signal}
     texts = TERMS[place.kind]
     if place.kind == "acceleration":
         axis = place.of[1:]
         texts = texts | {f"coupling with {entry}": entry for entry in state if entry[1:] != axis} | dict(own)
         known |= {"q": state[place.of], "v": state[f"v{axis}"]}
-    return {f"{name} of {place.of}": evaluate(text, known) for name, text in texts.items()}
+    return {f"{name} of {place.of}": (place, evaluate(text, known)) for name, text in texts.items()}
 
 
 def missing_terms(
@@ -78,28 +81,32 @@ def missing_terms(
     motion of ``theta (p,)``, to first order. A scene whose velocities are not those of its positions has no accelerations.
     """
     path, controls = (part[:, :, 0] for part in model.motion(theta[:, None]))
-    state, n_q = dict(zip(model.entries, path.T, strict=True)), model.program.scene.n_q
-    places, n_v = _places(model, path, controls), len(state) - n_q
-    acting = [
-        (k, name, course)
-        for k, place in enumerate(places)
-        if place.kind != "acceleration" or n_v == n_q
-        for name, course in _courses(place, state, own or {}).items()
-    ]
-    # of an effect when it is computed, relative to the largest value of what it acts on
-    relative = 1e-4
-    courses = np.zeros((len(path), len(places), len(acting)))
-    for column, (k, _, course) in enumerate(acting):
-        courses[:, k, column] = relative * places[k].size * course / (np.abs(course).max() or 1.0)
-    ends = np.cumsum([len(state), n_v, controls.shape[1]])
-    starts, pushes, nudges, sensors = np.split(np.concatenate([courses, -courses], axis=2), ends, axis=1)
-    wide = np.repeat(theta[:, None], starts.shape[2], axis=1)
-    moved = model.record(wide, lambda s, *_: pushes[s], lambda s: nudges[s], starts[0])
-    seen = moved + sensors[np.array(model.steps)].reshape(moved.shape)
-    up, down = np.split(seen / (2.0 * relative * sigma), 2, axis=1)
+    state, scene = dict(zip(model.entries, path.T, strict=True)), model.program.scene
+    places = _places(model, path, controls)
+    effects: Effects = {}
+    for place in places:
+        if place.kind != "acceleration" or scene.n_q == scene.n_v:
+            effects |= _effects(place, state, own or {})
+    changes = _changes(model, theta, sigma, places, effects)
     free = {name.replace(".", " of ") for name in model.names}
     return {
-        name: effect
-        for (_, name, _), effect in zip(acting, (up - down).T, strict=True)
-        if name not in free and np.isfinite(effect).all() and effect.any()
+        name: change
+        for name, change in zip(effects, changes, strict=True)
+        if name not in free and np.isfinite(change).all() and change.any()
     }
+
+
+def _changes(model: Model, theta: np.ndarray, sigma: float, places: list[_Place], effects: Effects) -> np.ndarray:
+    """Return the change of the standardised record per unit of each effect, ``(effects, m)``, by central differences."""
+    # half the distance of the two records, relative to the size of what an effect acts on
+    step = 1e-4
+    courses = np.zeros((len(places[0].signal), len(places), len(effects)))
+    for column, (place, course) in enumerate(effects.values()):
+        courses[:, places.index(place), column] = step * place.size * course / (np.abs(course).max() or 1.0)
+    both, kinds = np.concatenate([courses, -courses], axis=2), np.array([place.kind for place in places])
+    starts, pushes, nudges, sensors = (both[:, kinds == kind] for kind in TERMS)
+    wide = np.repeat(theta[:, None], both.shape[2], axis=1)
+    record = model.record(wide, lambda s, *_: pushes[s], lambda s: nudges[s], starts[0])
+    seen = record + sensors[np.array(model.steps)].reshape(record.shape)
+    up, down = np.split(seen.T / (2.0 * step * sigma), 2)
+    return up - down

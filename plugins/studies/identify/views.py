@@ -111,7 +111,6 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
             "What a record cannot show",
             UNNOTICED,
             terminal=not split,
-            page=True,
             split=split,
         ),
         Table(
@@ -129,7 +128,6 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
             "Records",
             RECORDS,
             terminal=True,
-            page=True,
         ),
         Table(
             "identify",
@@ -138,7 +136,6 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
             "Fits",
             NOTES,
             terminal=True,
-            page=True,
         ),
         *(Table(name, frame) for name, frame in (("estimates", found), ("unnoticed", hidden), ("fits", lines))),
     ]

@@ -353,13 +353,12 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
                 "Windows",
                 [WINDOW_NOTE, WINDOW_VERDICTS],
                 terminal=True,
-                page=True,
                 details=["gradient_typical"],
             )
         )
     if len(faults):
         notes = [FAULT_NOTE, *(f"- {code}: {RULES[code][1]}" for code in faults["code"].unique())]
-        tables.append(Table("faults", faults, FAULTS, "Faults in the logs", notes, page=True))
+        tables.append(Table("faults", faults, FAULTS, "Faults in the logs", notes))
     cells = rows.assign(problem=runs["problem"], method=runs["method"]).fillna({"problem": "", "method": ""})
     by_name = experiment.columns.by_name
     return Views(tables, _charts(shown, windows), cells, [METHOD, *(by_name[name] for name in PAGE)])
