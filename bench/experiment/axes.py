@@ -68,18 +68,6 @@ def _number(value: Any) -> float:
     return float(value) if is_number or value in ("inf", "-inf") else math.nan
 
 
-def shown_by(column: str, axis: Axis, rows: pd.DataFrame) -> np.ndarray:
-    """Return, per row, whether ``column`` (``stiffness`` or ``smoothing``) shows the axis for its contact law."""
-
-    found = named(rows, axis.names)
-    of_law = [
-        (part, law, name)
-        for part, law, name in found
-        if part == "contact" and name == (smoothing_of(law) if column == "smoothing" else column)
-    ]
-    return found[of_law].notna().any(axis=1).to_numpy()
-
-
 def smoothing_of(law: str) -> str:
     """Return the parameter that the column ``smoothing`` shows for a contact law; empty if there is none."""
     return str(getattr(plugin_class("contact", law), "smoothing", ""))

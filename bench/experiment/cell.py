@@ -232,10 +232,8 @@ class Cell:
 
     def _own_column(self, name: str, *parts: Plugin | None, default: float = math.nan) -> float:
         """Return the parameter ``name`` of the first part that has it, or ``default``."""
-        for part in parts:
-            if part is not None and name in parameters(type(part)):
-                return float(getattr(part, name)) if name != "horizon" else int(getattr(part, name))
-        return default
+        known = (part for part in parts if part is not None and name in parameters(type(part)))
+        return next((float(getattr(part, name)) for part in known), default)
 
     def _dim(self) -> float:
         try:

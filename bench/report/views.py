@@ -15,18 +15,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.experiment.axes import Axis, axes, relabel, shown_by, values_of
-from bench.experiment.columns import IDENTITY
+from bench.experiment.axes import Axis, axes, relabel, smoothing_of, values_of
+from bench.experiment.columns import FIRST, IDENTITY
 from bench.experiment.experiment import Experiment
-from bench.experiment.parameters import completed_rows
+from bench.experiment.parameters import completed_rows, named
 from bench.measure.timing import NOISY
 from bench.report.text import number
 
 CATEGORIES = ("scene", "contact", "integrator", "noise")
-NUMBERS = ("horizon", "dt", "stiffness", "sigma", "smoothing", "descent", "samples", "repeats")
+NUMBERS = tuple(column.name for column in FIRST if column.kind == "number" and column.name != "seed")
 """Numeric identity columns; with the categories and the swept axes they identify the problem of a row."""
-VIEWS_OF_LAWS = ("stiffness", "smoothing")
-"""Columns that repeat a parameter of the contact law, which may be swept under its own name."""
 CELL = ("study", "parameters", "samples", "repeats", "seed")
 """The columns that identify a cell."""
 CLOSE = 1e-2
@@ -73,8 +71,12 @@ def arrange(experiment: Experiment, rows: pd.DataFrame) -> Arranged:
     table = relabel(rows, swept_axes)
     for axis in swept_axes:
         if axis.column not in rows:
-            views = {view: table[view].mask(shown_by(view, axis, rows)) for view in VIEWS_OF_LAWS}
-            table = table.assign(**{axis.column: values_of(axis, rows)}, **views)
+            table = table.assign(**{axis.column: values_of(axis, rows)})
+            # `stiffness` and `smoothing` repeat a parameter of the law, which is swept under its own name here
+            for (part, law, name), values in named(rows, axis.names).items():
+                view = "smoothing" if name == smoothing_of(law) else name
+                if part == "contact" and view in rows:
+                    table[view] = table[view].mask(values.notna())
     return Arranged(experiment, table, tuple(swept_axes))
 
 
