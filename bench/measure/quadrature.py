@@ -44,6 +44,11 @@ HALVINGS, SLOW, MOST, AROUND = 32, 20, 1 << 14, 256
 panels around the largest cost."""
 SEARCHED, SEARCH = 5.0, (1 << 11, 1 << 13)
 """Distance searched for narrow features on lines through w = 0, and panels of the coarse and the fine rule on a line."""
+SKIPPED, LAST = 8, 5
+"""First halvings of panels, whose changes show no power yet, and last changes, of which the largest is the error at a pole."""
+DIVERGES, HEAVY = 0.95, 0.5
+"""Fitted powers p of a pole 1 / distance^p from which on the mean may not exist (p = 1, less the error of the fit), and samples
+have no variance."""
 SOLVED = 1e-11
 """Relative error of costs of programs whose steps solve an equation to 1e-12."""
 PROBES, STEP = 32, 1e-7
@@ -191,8 +196,7 @@ def _integral(
         lines = [partial(integrand.along, level.peak, axis) for axis in np.eye(width)]
         power = max(_bisected(line, np.linspace(-1.0, 1.0, AROUND))[3] for line in lines)
     spacing = float(np.prod(limits.high - limits.low)) ** (1.0 / width) / used ** (1.0 / width)
-    # the integral of 1 / distance^power over a line diverges from power 1 on
-    if power > 0.95:
+    if power > DIVERGES:
         place = ", ".join(f"{x:.6g}" for x in integrand.theta[:width] + sigma * level.peak)
         return integrand.unknown(
             f"the cost is infinite near theta = ({place}), a pole, so its mean may not exist", used, spacing
@@ -202,9 +206,9 @@ def _integral(
     if missed > allowed:
         error += missed
         doubts.append("the cost has a feature narrower than the spacing of the points")
-    if power >= 0.5:
+    if power >= HEAVY:
         doubts.append(f"the cost grows as 1 / distance^{power:.2g}, so samples have no variance")
-    # relative rounding error of the integral of absolute values, in unit roundoffs: a node's weight has a few
+    # the integral of absolute values has a relative rounding error of some unit roundoffs: each node's weight has a few
     solved = SOLVED if integrand.problem.program.needs_root else 64.0 * np.finfo(float).eps
     error += limits.beyond / sigma + rounding + solved * level.size
     return Integral(mean, error, used, spacing, "; ".join(doubts))
@@ -321,7 +325,7 @@ def _limits(excess: Callable[[np.ndarray], np.ndarray], width: int) -> _Limits:
     unseen, nearest, note = shells.unseen(), SPACING * (shells.last.min() + 1), ""
     if shells.ended.any() and nearest >= REACH:
         note = f"costs beyond {nearest:g} standard deviations are not finite, so the mean may not exist"
-    # share of the mass beyond the last finite points above which the integral may not exist
+    # with a larger share of the mass beyond the last finite points, the integral may not exist
     if unseen > 1e-3 * total:
         return _Limits(
             low, high, math.nan, note or "the cost grows as fast as the normal density falls, so its mean may not exist"
@@ -398,12 +402,12 @@ def _bisected(integrand: Callable[[np.ndarray], np.ndarray], ends: np.ndarray) -
             break
         low, high = np.concatenate([low[is_open], middle[is_open]]), np.concatenate([middle[is_open], high[is_open]])
         whole = parts[:, is_open].ravel()
-    power, tail = 0.0, np.array(changes[8:])
+    power, tail = 0.0, np.array(changes[SKIPPED:])
     # the first panels may have missed a spike: halvings then go on until rounding alone changes it. Any one change may vanish
     # by chance, or be infinite where a node meets the pole
     at = np.flatnonzero(np.isfinite(tail) & (tail > SOLVED * size))
-    if at.size and at[-1] + 8 >= SLOW:
-        closed = max(closed, *tail[at[-5:]])
+    if at.size and at[-1] + SKIPPED >= SLOW:
+        closed = max(closed, *tail[at[-LAST:]])
         power = max(1.0 + float(np.polyfit(at, np.log2(tail[at]), 1)[0]), 0.0)
     return total, closed, used, power
 
@@ -433,7 +437,7 @@ def _noise(cost: Callable[[np.ndarray], np.ndarray], width: int) -> float:
     The fourth difference of independent errors of variance s^2 has the variance 70 s^2. A stencil that contains a kink
     or a jump is rare, and only makes the bound larger.
     """
-    # evenly spread over a disc of three standard deviations, away from round numbers
+    # the stencils are evenly spread over a disc of three standard deviations, away from round numbers
     turn = np.arange(PROBES)
     radius = 3.0 * np.sqrt((turn + 0.5) / PROBES)
     at = np.stack([radius * np.cos(2.4 * turn), radius * np.sin(2.4 * turn)])[:width]

@@ -31,8 +31,8 @@ DIRECTIONS = 16
 """Most coordinate directions in noise space searched for tails and jumps, besides the direction of the mean effect."""
 FAR = 4.5
 """Distance searched for jumps on either side along a direction, in standard deviations."""
-ROUNDING = 1e-9
-"""Difference of first and zeroth order, relative to the gradient, that rounding explains."""
+AGREE = 1e-9
+"""Difference of gradients, relative to their size, up to which they agree."""
 COMMON_ERROR = 1e-10
 """Relative error common to the terms of all samples, from rounding and central differences."""
 EXTREME = 1e100
@@ -334,7 +334,7 @@ class _Sampler:
             # both use the same noise, so their differences are independent samples too
             paired = (self.pilots["first_order"] - self.pilots["zeroth_order"]).T
             low = bias_interval(paired.mean(axis=0), Sampling.of(paired), level=REFUSED)[1]
-            if low > ROUNDING * np.abs(paired).max():
+            if low > AGREE * np.abs(paired).max():
                 return "first and zeroth order disagree in the pilot, so zeroth order is used"
         count = min(self.directions.shape[1], self.pilot.shape[1] // 3)
         (through, first, last), along = np.split(self.pilot[:, : 3 * count], 3, axis=1), self.directions[:, :count]
@@ -366,7 +366,7 @@ class _Sampler:
             return _failed(problem, "noise rarer than any sample dominates the mean, which may not exist")
         if not note and heavy_tails(batches - batches.mean(axis=0)):
             note = "the reference's batches have heavy tails, so its standard error is uncertain"
-        elif np.ptp(batches, axis=0).max() <= ROUNDING * np.abs(batches).max():
+        elif np.ptp(batches, axis=0).max() <= AGREE * np.abs(batches).max():
             rare = THREE / count
             unseen = math.hypot(unseen, rare * float(np.linalg.norm(batches[0])))
             note = (
@@ -409,7 +409,7 @@ class _Sampler:
         rows = np.concatenate([error.rows for error in errors])
         spread = math.sqrt(2.0 * float(np.square(rows @ rows.T).sum()))
         z = float((apart @ apart - trace) / spread) if spread else 0.0 if not apart.any() else math.inf
-        size = ROUNDING * (np.linalg.norm(reference.gradient) + np.linalg.norm(check.mean(axis=0)))
+        size = AGREE * (np.linalg.norm(reference.gradient) + np.linalg.norm(check.mean(axis=0)))
         at = {level: bias_interval(apart, *errors, level=level)[1] > size for level in (WARNED, REFUSED)}
         disagreement = f"first and zeroth order disagree by {np.linalg.norm(apart):.2g} (check_z={z:.1f})"
         if at[REFUSED]:

@@ -13,9 +13,7 @@ from bench.errors import UserError
 from bench.model.ops import Array
 
 
-def adam(
-    rate: float, updates: int, clip: float, beta1: float = 0.7, beta2: float = 0.95
-) -> optax.GradientTransformation:
+def adam(rate: float, updates: int, clip: float, beta1: float, beta2: float) -> optax.GradientTransformation:
     """Return Adam with a norm clipped at ``clip``, and a rate that falls linearly to 1e-5 over ``updates`` steps."""
     # learning rate at the end of a run (Xu et al. 2022, public configuration)
     schedule = optax.linear_schedule(rate, min(1e-5, rate), updates)

@@ -39,10 +39,6 @@ class ActorCritic(Neural):
         memory = self.critic_optimizer(env).init(network)
         return run._replace(key=key, critic=Critic(network, jax.tree.map(lambda x: 1.0 * x, network), memory))
 
-    def window_of(self, env: Any, state: Run, actor: Any, key: Any, *cuts: Any) -> tuple[Any, Any]:
-        """Return the episodes after the next window of an actor, and the window."""
-        return self.rolled(env, state, actor, state.episodes, self.window, key, *cuts)
-
     def values_of(self, state: Run, network: Any, window: Any) -> Any:
         """Return a network's values of the states that a window's steps reached, 0 where none follows, ``(h, B)``."""
         import jax.numpy as jnp

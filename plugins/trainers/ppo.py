@@ -67,7 +67,7 @@ class Ppo(ActorCritic):
 
         critic = state.critic
         key, key_window, key_actor, key_critic = jax.random.split(state.key, 4)
-        episodes, window = self.window_of(env, state, state.actor, key_window)
+        episodes, window = self.rolled(env, state, state.actor, state.episodes, self.window, key_window)
         observation, action = windows.flat(window.observation), windows.flat(window.action)
         seen = normaliser.normalised(state.normaliser, observation)
         # rewards are in standard deviations of the returns so far, without the critic's values, whose errors would grow

@@ -42,7 +42,7 @@ class Shac(ActorCritic):
         key, key_window, key_critic = jax.random.split(state.key, 3)
 
         def loss(actor: Any) -> tuple[Any, Any]:
-            episodes, window = self.window_of(env, state, actor, key_window, self.cut)
+            episodes, window = self.rolled(env, state, actor, state.episodes, self.window, key_window, self.cut)
             value = self.values_of(state, critic.target, window)
             cost = -windows.gains(window, value, self.discount).mean()
             return cost - self.entropy * actor.log_deviation.sum(), (episodes, window, value)
@@ -68,7 +68,7 @@ class Shac(ActorCritic):
     def parts(self, env: Any, state: Run, actor: Any, key: Any, every: int = 0) -> tuple[Any, Any, Any]:
         from bench.training import windows
 
-        _, window = self.window_of(env, state, actor, key, self.cut, every)
+        _, window = self.rolled(env, state, actor, state.episodes, self.window, key, self.cut, every)
         value = self.values_of(state, state.critic.target, window)
         gained = windows.gains(window, value, self.discount, every)
         return gained, window.cut, windows.log_probability(actor, state.normaliser, window)

@@ -34,8 +34,7 @@ from bench.report.writer import LEAST
 
 from .columns import COLUMNS
 from .comparisons import FAILS, NO_RESULT
-from .time_to_accuracy import SAMPLES, TARGETS, TIME, with_known
-from .time_to_accuracy import methods as methods_by_cost
+from .time_to_accuracy import SAMPLES, TARGETS, TIME, methods_by_cost, with_known
 
 FLOOR = 1e-4
 """Relative errors below this are drawn here, as upper limits."""
@@ -43,9 +42,9 @@ GRADES = {0.1: "#08519c", 0.3: "#6baed6", 1.0: "#d6e6f4", 10.0: "#fdae61", math.
 """Upper ends of the grades of an error, and their colours."""
 BEHIND = {3.0: "#6baed6", 10.0: "#d6e6f4", math.inf: "#fdae61"}
 """Upper ends of the grades of a factor to the first method, and their colours."""
-FIRST = "first, or tied: the 95% interval of its factor to the first reaches 1"
+LEADS = "first, or tied: the 95% interval of its factor to the first reaches 1"
 LIMIT = "<: an upper limit, 10 or more times the first"
-CLOSE = 0.03
+SAME_LINE = 0.03
 """Largest relative difference of backends that are one line."""
 PANELS = 4
 """Most problems of a chart along an axis."""
@@ -203,7 +202,9 @@ def _lines(problem: ProblemRows, compared: str, names: Sequence[str]) -> pd.Data
 
     Backends that agree are one line unless they are compared.
     """
-    curves = estimator_curves(problem.rows, None if compared == "backend" else CLOSE).assign(problem=problem.title())
+    curves = estimator_curves(problem.rows, None if compared == "backend" else SAME_LINE).assign(
+        problem=problem.title()
+    )
     if compared:
         others = joined({**problem.identity, compared: ""})
         curves = curves[_is_named(curves[compared], names)]
@@ -215,7 +216,7 @@ def _lines(problem: ProblemRows, compared: str, names: Sequence[str]) -> pd.Data
         )
     # those that differ from the first are named after their backends
     first = curves["curve"] == curves.groupby("label")["curve"].transform("min")
-    other = curves["method"] + f": over {CLOSE:.0%} apart"
+    other = curves["method"] + f": over {SAME_LINE:.0%} apart"
     return curves.assign(series=curves["label"].where(first, other), panel=problem.title())
 
 
@@ -352,7 +353,7 @@ def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Cha
     return Chart(
         "speed_accuracy",
         frame.assign(
-            grade=grades.mask(frame["leads"], FIRST),
+            grade=grades.mask(frame["leads"], LEADS),
             cell=frame["sign"] + frame["cost"].map(short_duration),
         ),
         [text("problem", label="")],
@@ -362,7 +363,7 @@ def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Cha
         level="grade",
         cell="cell",
         across=1,
-        styles={FIRST: Style(GRADES[0.1])} | looks | {LIMIT: Style("#bdbdbd")},
+        styles={LEADS: Style(GRADES[0.1])} | looks | {LIMIT: Style("#bdbdbd")},
         failed_name="not known to be reached",
         title=f"Which method reaches an error of {target:.0%} first?",
         subtitle=", ".join(

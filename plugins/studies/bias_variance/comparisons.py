@@ -37,7 +37,7 @@ LAW = (
     "rmse_rel",
 )
 """Columns from which the error at other numbers of samples follows: RMSE^2 = bias^2 + v / N."""
-COLUMNS = (
+COMPARED = (
     text("problem", "what distinguishes the problem from the others"),
     text("axis", "the swept quantity along which the problem is reported"),
     setting("at", "its value"),

@@ -56,7 +56,7 @@ def with_known(rows: pd.DataFrame, cost: str) -> pd.DataFrame:
 SAMPLES = Axis("samples", ("samples",))
 COSTS = {"time": TIME, "rollouts": ROLLOUTS}
 TEXTS: dict[str, Callable[[float], str]] = {"time": short_duration, "rollouts": axis_value}
-LEAST = 1e-200
+SMALLEST_ERROR = 1e-200
 """Errors below this count as this much, since costs are interpolated in logarithms: identical estimates may have none."""
 TARGETS = (0.1, 0.01)
 """Target relative errors."""
@@ -135,7 +135,7 @@ def _at_interval_end(rows: pd.DataFrame, end: str) -> pd.DataFrame:
     """Return rows with variance and bias at an end of their 95% intervals; the bias is 0 unless distinguishable from 0."""
     bias = rows[f"bias_{end}"].where(rows["bias_low"] > 0, 0.0)
     error = np.hypot(bias, np.sqrt(rows[f"variance_{end}"])) / rows["reference_norm"]
-    return rows.assign(bias=bias, variance=rows[f"variance_{end}"], rmse_rel=np.maximum(error, LEAST))
+    return rows.assign(bias=bias, variance=rows[f"variance_{end}"], rmse_rel=np.maximum(error, SMALLEST_ERROR))
 
 
 def lead(first: RequiredCost, second: RequiredCost) -> tuple[float, float, float]:
@@ -200,7 +200,7 @@ def table(shown: Arranged) -> pd.DataFrame:
     return pd.DataFrame(entries)
 
 
-def methods(problem: ProblemRows, target: float, cost: str) -> dict[str, RequiredCost]:
+def methods_by_cost(problem: ProblemRows, target: float, cost: str) -> dict[str, RequiredCost]:
     """Return each method's cost to reach an error. For time a method is an estimator on a backend, else an estimator."""
     curves = estimator_curves(problem.rows, close=None)
     names = curves["label"] + (" on " + curves["backend"] if cost == TIME else "")
@@ -222,7 +222,7 @@ def estimator_of(method: str) -> str:
 
 def line(problem: ProblemRows, target: float, kind: str) -> dict[str, Any]:
     """Return a line of the table: the cheapest method, the next of another estimator, and excluded ones."""
-    reached = methods(problem, target, COSTS[kind]) or {"-": RequiredCost("never")}
+    reached = methods_by_cost(problem, target, COSTS[kind]) or {"-": RequiredCost("never")}
     first = min(reached, key=lambda name: (order(reached[name])[0], name))
     best, by_how = (
         reached[first],

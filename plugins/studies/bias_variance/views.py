@@ -22,8 +22,8 @@ from bench.report.views import arrange, pareto, shown_rmse
 
 from . import charts, descents, time_to_accuracy, trust
 from .columns import COLUMNS
-from .comparisons import COLUMNS as COMPARED
 from .comparisons import (
+    COMPARED,
     ERROR,
     FAILS,
     LAW,

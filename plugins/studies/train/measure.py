@@ -26,8 +26,6 @@ from bench.training.run import Training
 from . import Train
 from .verdicts import FINITE
 
-CURVE = ("update", "step", "s", "return", "return_low", "return_high")
-"""What is stored of each evaluation."""
 MEANS = frozenset({"loss", "reward", "value_loss", "cut", "used", "contacts", "step_length", "deviation"})
 """Quantities whose mean an entry of a stored log has; it has the largest value of the others, so that no peak is lost."""
 LENGTHS = (1e-6, 1e-7, 1e-8)
@@ -45,7 +43,7 @@ def measure(cell: Cell, session: Session, settings: Train) -> dict[str, Any]:
     total, per_update = trainer.updates(env), trainer.steps_per_update(env)
     marks = set(np.unique(np.linspace(0, total, min(settings.evaluations, total) + 1).round().astype(int)).tolist())
     checks = _spread(total, settings.cosines) if trainer.first_order else set()
-    halfway = max(total // 2, 1) if trainer.first_order else 0
+    halfway = max(total // 2, 1) if trainer.first_order else -1
 
     state = training.start(cell.seed)
     training.returns(state, starts)
@@ -66,7 +64,7 @@ def measure(cell: Cell, session: Session, settings: Train) -> dict[str, Any]:
         if update in checks:
             agreement = training.agreement(state, update + 1, settings.copies)
             cosines.append((update, agreement["cosine"], agreement["cosine_denoised"]))
-        if update == halfway and trainer.first_order:
+        if update == halfway:
             exact = _training(cell, dataclasses.replace(backend, dtype="float64"))
             probe = {"slope_errors": slope_errors(exact, state), **_windows(training, state, settings.batches)}
         started = time.perf_counter()
@@ -74,7 +72,7 @@ def measure(cell: Cell, session: Session, settings: Train) -> dict[str, Any]:
         spent += time.perf_counter() - started
         log.append({name: float(value) for name, value in entry.items()})
 
-    table = np.array(curve)
+    table, stored = np.array(curve), ("update", "step", "s", "return", "return_low", "return_high")
     final = table[-1, 3:]
     norms = _column(log, "gradient_norm")
     return {
@@ -91,7 +89,7 @@ def measure(cell: Cell, session: Session, settings: Train) -> dict[str, Any]:
         "gradient_peak": float(np.nanmax(norms)),
         "gradient_zero": float((norms == 0).mean()),
         **probe,
-        **{f"curve_{name}": table[:, i].tolist() for i, name in enumerate(CURVE)},
+        **{f"curve_{name}": table[:, i].tolist() for i, name in enumerate(stored)},
         **{name: [row[i] for row in cosines] for i, name in enumerate(("cosine_update", "cosine", "cosine_denoised"))},
         **_thinned(log, settings.entries),
     }

@@ -49,14 +49,12 @@ SUMMARY = (
     Column("cosine", label="cosine"),
 )
 WINDOW = setting("window", label="window", unit="steps")
-WINDOW_GRADIENT = Column("window_gradient", label="norm of the windows' gradient")
-WINDOW_BIAS = interval("window_bias", label="bias of the windows' gradient")
 WINDOWS = (
     PROBLEM,
     text("family", label="trainer"),
     WINDOW,
-    WINDOW_GRADIENT,
-    replace(WINDOW_BIAS, label="its bias"),
+    Column("window_gradient", label="norm of the windows' gradient"),
+    interval("window_bias", label="its bias"),
     Column("gradient_typical", label="gradient norm in training"),
     FINAL,
     VERDICT,
@@ -69,7 +67,6 @@ FAULTS = (
     setting("update"),
     Column("value"),
 )
-COST = interval("cost", label="minus the return of an episode", ends="95% interval over seeds")
 STEP, TIME = (
     Column("step", label="control steps", log=False),
     Column("time", label="time of the updates", unit="s", log=True),
@@ -368,7 +365,8 @@ def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
     frame = curves_of(runs)
     middles = "lower is better; interquartile mean over {:g} seeds".format
     reported = middles(runs["seed"].nunique())
-    cost = replace(COST, log=bool((frame["cost"] > 0).all()))
+    is_log = bool((frame["cost"] > 0).all())
+    cost = interval("cost", label="minus the return of an episode", ends="95% interval over seeds", log=is_log)
     curves = Chart(
         "train",
         frame.dropna(subset=["step"]),
