@@ -34,6 +34,6 @@ def write(directory: Path, results: Results) -> list[Path]:
         "claims.md": tables.markdown(results),
         "claims.csv": csv_text(figures),
         "claims.html": document.page(tables.TITLE, QUESTION, views, cells, drawn),
-        ANSWER: answer_json("claims", QUESTION, answer, drawn[0][0].name if drawn else ""),
+        ANSWER: answer_json("claims", QUESTION, answer, drawn),
     }
     return write_all(directory, content)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,18 +30,6 @@ NOTES = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class History:
-    """Errors and failures, one line per result, experiment and series."""
-
-    table: pd.DataFrame
-    """``result``, ``experiment``, ``series`` (an estimator, or a backend in studies without), ``column`` (the error's),
-    ``error`` (geometric mean of the ratios to the first result, over the cells that are ok in all results), ``cells``
-    (their number), ``moved`` (the largest distance of a cell's gradient from that of the first result, relative to its
-    norm, in studies that store gradients), ``failed`` and ``of`` (all cells of the series)."""
-    names: Sequence[str]
-
-
 def main(words: Sequence[str]) -> int:
     """Write the history of the results named in ``words``, the oldest first. Returns 0. Raises :class:`UserError`."""
     names, settings, _ = parse_words(words, "history", {"out": "runs/history"})
@@ -52,8 +40,14 @@ def main(words: Sequence[str]) -> int:
     return 0
 
 
-def compute_history(names: Sequence[str], results: Sequence[Mapping[str, Results]]) -> History:
-    """Return the history of the experiments in all results. Raises :class:`UserError` if there are none."""
+def compute_history(names: Sequence[str], results: Sequence[Mapping[str, Results]]) -> pd.DataFrame:
+    """Return errors and failures, a line per result, experiment and series. Raises :class:`UserError` without a common experiment.
+
+    Columns: ``result``, ``experiment``, ``series`` (an estimator, or a backend in studies without), ``column`` (the error's),
+    ``error`` (geometric mean of the ratios to the first result, over the cells that are ok in all results), ``cells``
+    (their number), ``moved`` (the largest distance of a cell's gradient from that of the first result, relative to its
+    norm, in studies that store gradients), ``failed`` and ``of`` (all cells of the series).
+    """
     shared = [name for name in results[0] if all(name in other for other in results)]
     if not shared:
         raise UserError(f"{', '.join(names)} have no experiment in common")
@@ -92,7 +86,7 @@ def compute_history(names: Sequence[str], results: Sequence[Mapping[str, Results
                         "of": len(of),
                     }
                 )
-    return History(pd.DataFrame(lines), list(names))
+    return pd.DataFrame(lines)
 
 
 def _log_ratios(was: pd.Series, now: pd.Series) -> np.ndarray:
@@ -102,8 +96,8 @@ def _log_ratios(was: pd.Series, now: pd.Series) -> np.ndarray:
     return np.asarray(np.log(values[:, 1] / values[:, 0]))
 
 
-def write(history: History, out: Path) -> list[Path]:
-    """Write ``history`` as .csv, .md and .png into a folder. Raises :class:`StorageError` if that fails."""
+def write(history: pd.DataFrame, out: Path) -> list[Path]:
+    """Write the history as .csv, .md and .png into a folder. Raises :class:`StorageError` if that fails."""
     from bench.report.draw import draw
     from bench.report.figures import save, styled
     from bench.report.writer import table_files
@@ -116,15 +110,12 @@ def write(history: History, out: Path) -> list[Path]:
         return [*paths, *save(draw(chart), out / chart.name, data=chart.plotted())]
 
 
-def views(history: History) -> Views:
+def views(history: pd.DataFrame) -> Views:
     """Return the table of all series, and small multiples of the series that changed."""
-    table = history.table.assign(
-        line=[
-            ": ".join(filter(None, pair))
-            for pair in zip(history.table["experiment"], history.table["series"], strict=True)
-        ],
-        failures=[f"{f} of {n}" for f, n in zip(history.table["failed"], history.table["of"], strict=True)],
-        result=history.table["result"].map(_short_names(history.names)),
+    table = history.assign(
+        line=[": ".join(filter(None, pair)) for pair in zip(history["experiment"], history["series"], strict=True)],
+        failures=[f"{f} of {n}" for f, n in zip(history["failed"], history["of"], strict=True)],
+        result=history["result"].map(_short_names(history["result"].unique())),
     )
     parts = dict(iter(table.groupby("line", sort=False)))
     moved = [name for name, part in parts.items() if _is_changed(part)]
@@ -156,7 +147,7 @@ def views(history: History) -> Views:
         Column("moved", label="gradient moved"),
         text("failures", label="failed"),
     ]
-    return Views([Table("history", table, columns, QUESTION, NOTES, data=history.table)], [chart])
+    return Views([Table("history", table, columns, QUESTION, NOTES, data=history)], [chart])
 
 
 def _is_changed(part: pd.DataFrame) -> bool:
@@ -165,7 +156,7 @@ def _is_changed(part: pd.DataFrame) -> bool:
     return bool(error > 1.01 or part["failed"].nunique() > 1 or (part["moved"] > ROUNDING).any())
 
 
-def _short_names(names: Sequence[str]) -> dict[str, str]:
+def _short_names(names: Iterable[str]) -> dict[str, str]:
     """Return the part of each name before the end that all have, such as the revision in ``REV:results/standard``."""
     parts = [re.split(r"(?=[:/])", name.rstrip("/")) for name in names]
     while all(len(part) > 1 and part[-1] == parts[0][-1] for part in parts):

@@ -47,8 +47,6 @@ DESIGNS: tuple[tuple[int, dict[str, Any]], ...] = (
     (16, {"draws": "sobol"}),
 )
 """Numbers of samples and designs of the noise that are checked."""
-DESIGNED = 4
-"""Number of oracles of such a check."""
 
 
 class RecordingProblem(Problem):
@@ -356,9 +354,8 @@ def bias_under_every_design(estimator: Estimator) -> str:
     """
     skip_unless(estimator.unbiased and estimator.target == "smoothed", "declares a bias, or another target")
     candidates = usable(estimator, [o for o in oracles() if o.program.continuous])
-    candidates = sorted(candidates, key=lambda oracle: oracle.problem.dim)[
-        :DESIGNED
-    ]  # in few dimensions, bias stands out
+    # in few dimensions, bias stands out
+    candidates = sorted(candidates, key=lambda oracle: oracle.problem.dim)[:4]
     details = []
     for count, given in DESIGNS:
         method = dataclasses.replace(estimator, **given)

@@ -166,12 +166,7 @@ FIRST = (
     setting("stiffness", "stiffness of the contact law, or of the scene without one", "N/m"),
     setting("sigma", "standard deviation of the noise in J"),
     setting("smoothing", "smoothing parameter of the contact law: beta, kappa"),
-    Column(
-        "descent",
-        "share of a descent from theta0 that is done where the gradient is taken",
-        format="setting",
-        default=0.0,
-    ),
+    setting("descent", "share of a descent from theta0 that is done where the gradient is taken", default=0.0),
     setting("samples", "samples N in one estimate"),
     setting("repeats", "independent estimates R that measure bias and variance"),
     setting("seed", "seed of the noise"),

@@ -8,6 +8,9 @@ import numpy as np
 
 from bench.model.blocks import padded
 
+N_COLUMNS = 4096
+"""Columns of every batch of a reference, constant so that a compiling backend compiles once, and fewer if few samples are drawn."""
+
 
 def in_columns(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray, columns: int) -> np.ndarray:
     """Return ``function(w)``, ``(..., B)``, for noise ``w (n_w, B)``, evaluated ``columns`` at a time.

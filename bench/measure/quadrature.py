@@ -10,7 +10,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from bench.measure.batches import in_columns
+from bench.measure.batches import N_COLUMNS, in_columns
 from bench.model import Problem
 
 NODES = 8
@@ -75,11 +75,10 @@ class _NotFinite(Exception):
 
 @dataclass(frozen=True)
 class _Integrand:
-    """The integrand [f(w) - f(0)] w / sigma of a problem at ``theta (d,)``; its cost is evaluated ``columns`` points at a time."""
+    """The integrand [f(w) - f(0)] w / sigma of a problem at ``theta (d,)``."""
 
     problem: Problem
     theta: np.ndarray
-    columns: int
 
     @property
     def width(self) -> int:
@@ -93,7 +92,7 @@ class _Integrand:
 
     def cost(self, nodes: np.ndarray) -> np.ndarray:
         """Return f(w) at ``nodes (width, B)``: ``(B,)``."""
-        return in_columns(lambda w: self.problem.value(self.theta, w), nodes, self.columns)
+        return in_columns(lambda w: self.problem.value(self.theta, w), nodes, N_COLUMNS)
 
     def excess(self, nodes: np.ndarray) -> np.ndarray:
         """Return f(w) - f(0) at ``nodes (width, B)``: ``(B,)``."""
@@ -151,7 +150,7 @@ class _Level:
         return replace(self, change=change, size=size, densest=peak.densest, peak=peak.peak)
 
 
-def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) -> Integral | None:
+def integrate(problem: Problem, theta: np.ndarray, points: int) -> Integral | None:
     """Return the smoothed gradient E[(f(w) - f(0)) w] / sigma for one- or two-dimensional noise on theta, by quadrature.
 
     Gauss-Legendre panels lie between the scene's breakpoints and are halved until the error is negligible or the next
@@ -161,9 +160,9 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
     of integration are where the integrand has vanished, see :func:`_limits`, and the error includes the remainder
     beyond them. Returns None where two levels, the last of at least :data:`LEAST` points, do not fit, or a cost within
     the limits is not finite. A feature of the cost that is narrower than the spacing and not among the breakpoints is
-    missed. The cost is evaluated ``columns`` points at a time.
+    missed.
     """
-    integrand, sigma = _Integrand(problem, theta, columns), problem.sigma
+    integrand, sigma = _Integrand(problem, theta), problem.sigma
     width, limits = integrand.width, _limits(integrand.excess, integrand.width)
     if math.isnan(limits.beyond):
         return integrand.unknown(limits.note)

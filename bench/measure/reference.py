@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 
 from bench.measure import noise
-from bench.measure.batches import in_columns
+from bench.measure.batches import N_COLUMNS, in_columns
 from bench.measure.jumps import coordinates, largest_jump
 from bench.measure.quadrature import TOLERANCE, integrate
 from bench.measure.statistics import THREE, Sampling, Truth, bias_interval, heavy_tails
@@ -18,9 +18,6 @@ from bench.model import Problem, Program
 
 BATCHES = 64
 """Number of independent batch means that represent a sampled reference."""
-N_COLUMNS = 4096
-"""Columns of every evaluated batch, constant so that a compiling backend compiles once, and fewer if ``samples`` is
-small. The pilot, which selects the estimator of a sampled reference, is one batch."""
 LEAST_SAMPLES = 16384
 """Minimum samples of a sampled reference, unless the limit is lower: a small spread of few samples proves nothing."""
 TAIL_EVENTS = 10.0
@@ -186,7 +183,7 @@ def _compute(
     program = problem.program
     quadrature = None
     if _can_integrate(program):
-        integral = integrate(problem, theta, points, N_COLUMNS)
+        integral = integrate(problem, theta, points)
         if integral is not None:
             method = f"quadrature[points={integral.points},spacing={integral.spacing:.2g}]"
             quadrature = Reference(

@@ -8,7 +8,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bench.measure.reference import BATCHES, LEAST_SAMPLES, N_COLUMNS, Reference, doubling_batches, draw_columns
+from bench.measure.batches import N_COLUMNS
+from bench.measure.reference import BATCHES, LEAST_SAMPLES, Reference, doubling_batches, draw_columns
 from bench.model import Problem, Program, compose
 
 

@@ -88,7 +88,7 @@ def constants(rows: pd.DataFrame, groups: pd.Series, names: Sequence[str]) -> pd
 
 
 def distinguishing_columns(
-    rows: pd.DataFrame, groups: pd.Series, names: Iterable[Any], always: Sequence[Any] = ("scene",)
+    rows: pd.DataFrame, groups: pd.Series, names: Iterable[Any], always: Sequence[Any]
 ) -> list[Any]:
     """Return the columns, of ``names``, that distinguish the groups, and the columns ``always``.
 

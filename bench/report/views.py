@@ -75,7 +75,7 @@ def arrange(experiment: Experiment, rows: pd.DataFrame) -> Arranged:
             # `stiffness` and `smoothing` repeat a parameter of the law, which is swept under its own name here
             for (part, law, name), values in named(rows, axis.names).items():
                 view = "smoothing" if name == smoothing_of(law) else name
-                if part == "contact" and view in rows:
+                if part == "contact" and view in NUMBERS:
                     table[view] = table[view].mask(values.notna())
     return Arranged(experiment, table, tuple(swept_axes))
 
@@ -203,7 +203,7 @@ def shown_rmse(row: Any) -> tuple[Any, Any, Any, Any]:
     return np.where(np.isnan(row["rmse_rel"]), math.nan, value), low, high, is_limit
 
 
-def bias_text(row: Any, norm: float = 1.0) -> str:
+def bias_text(row: Any, norm: float) -> str:
     """Format a bias divided by a norm: ``0.500 [0.400, 0.600]``, or ``0 (< 0.124)`` if not distinguishable from 0."""
     value, low, high = (row[c] / norm if norm > 0 else math.nan for c in ("bias", "bias_low", "bias_high"))
     if not low > 0 and math.isfinite(high):

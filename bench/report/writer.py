@@ -37,7 +37,7 @@ def write(experiment: Experiment, views: Views, drawn: Sequence[tuple[Chart, Seq
         for chart, widths in drawn:
             figure = widths[-1 if experiment.chart_columns == 1 else 0]
             charts += save(figure, experiment.directory / chart.name, experiment.formats, chart.plotted())
-    answer = answer_json(experiment.name, experiment.question, views.headline, drawn[0][0].name if drawn else "")
+    answer = answer_json(experiment.name, experiment.question, views.headline, drawn)
     files = {ANSWER: answer}
     for name in dict.fromkeys(table.name for table in views.tables):
         files |= table_files([table for table in views.tables if table.name == name], experiment.name)
@@ -69,8 +69,9 @@ def _is_telling(chart: Chart) -> bool:
     return len(frame) >= LEAST and (not is_line or frame[x].nunique() >= LEAST)
 
 
-def answer_json(experiment: str, question: str, answer: str, chart: str) -> str:
+def answer_json(experiment: str, question: str, answer: str, drawn: Sequence[tuple[Chart, Sequence[Figure]]]) -> str:
     """Return the content of :data:`ANSWER`."""
+    chart = drawn[0][0].name if drawn else ""
     content = {"experiment": experiment, "question": question, "answer": answer, "chart": chart}
     return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
 

@@ -36,15 +36,13 @@ def contact_columns(problem: Problem, program: Rollout, path: Jacobians) -> dict
         touching, gap, force = _of_engine(problem, path)
         if not len(gap):
             return columns
-        names = contact_names(problem)
     elif law is None or not isinstance(scene, ContactScene):
         return columns
     else:
         state = scene.split(path.states.T)
         gap = scene.gap(np, state.q)
         touching, force = _touching(program, scene, path)
-        names = contact_names(problem)
-    mode = touching.astype(int)
+    names, mode = contact_names(problem), touching.astype(int)
     if isinstance(scene, FrictionScene) and scene.friction > 0:
         mode = np.where(touching & (np.abs(scene.slip(np, *state)) > scene.slip_speed), 2, mode)
         columns |= {"sticking": (mode == 1).sum(axis=0), "slipping": (mode == 2).sum(axis=0)}

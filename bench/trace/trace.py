@@ -153,12 +153,10 @@ def trace(problem: Problem, w: np.ndarray) -> tuple[pd.DataFrame, float]:
         columns["adjoint_norm"] = np.linalg.norm(adjoint, axis=1)
     columns["step"] = np.arange(scene.horizon + 1)
     columns["time"] = columns["step"] * scene.dt
-    extra = [name for name in columns if name not in COLUMNS]
-    states = {f"q{i + 1}": path.states[:, i] for i in range(scene.n_q)}
-    states |= {f"v{i + 1}": path.states[:, scene.n_q + i] for i in range(path.states.shape[1] - scene.n_q)}
-    controls = {f"u{i + 1}": per_state(path.controls[:, i]) for i in range(scene.n_u)}
-    table = pd.DataFrame({name: columns[name] for name in [*COLUMNS, *extra]} | states | controls)
-    return table, gradient_error
+    parts = {"q": path.states[:, : scene.n_q], "v": path.states[:, scene.n_q :], "u": path.controls}
+    named = {f"{letter}{i}": values for letter, part in parts.items() for i, values in enumerate(part.T, 1)}
+    columns |= {name: values if len(values) > scene.horizon else per_state(values) for name, values in named.items()}
+    return pd.DataFrame({name: columns[name] for name in dict.fromkeys((*COLUMNS, *columns))}), gradient_error
 
 
 def per_state(values: Any) -> np.ndarray:

@@ -346,7 +346,7 @@ def test_history_draws_what_changed():
         for result, error, moved, failed in zip("abc", errors, moves, failures, strict=True)
     ]
     names = ["result", "experiment", "series", "column", "error", "cells", "moved", "failed", "of"]
-    made = history.views(history.History(pd.DataFrame(lines, columns=names), ["a", "b", "c"]))
+    made = history.views(pd.DataFrame(lines, columns=names))
     (chart,) = made.charts
     assert list(dict.fromkeys(chart.frame["line"])) == ["some: much", "some: lost", "some: moved"]
     assert chart.panel_notes == {"some: lost": "failed: 1, 1, 2 of 4"}

@@ -47,7 +47,7 @@ class _Training:
         self.tenth = max(len(self.updates) // 10, 1)
         self.late = np.median(self.norms[-self.tenth :])
 
-    def curve(self, end: str = "") -> np.ndarray:
+    def curve(self, end: str) -> np.ndarray:
         """Return the returns of the evaluations, or an end of their intervals."""
         return np.asarray(self.run[f"curve_return{end}"], dtype=float)
 
