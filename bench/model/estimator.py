@@ -62,8 +62,6 @@ class Estimator(Plugin):
     """Whether it smooths over theta, also where the noise is on a policy's actions, and so has another target there."""
     couples_samples: ClassVar[bool] = False
     """Whether its directions are chosen together or a model is fitted to them, so that the variance may fall faster than 1/N."""
-    gives_gradient: ClassVar[bool] = True
-    """Whether the estimate is a gradient that an optimizer can use."""
     least_samples: ClassVar[int] = 1
     """Fewest samples of an estimate."""
     in_units: ClassVar[bool] = False

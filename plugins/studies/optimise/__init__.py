@@ -36,7 +36,7 @@ class SearchStudy(StudyPackage):
     def refusal(self, cell: Cell) -> str | None:
         """Return what the optimizer needs and no part of the cell provides, or None."""
         optimizer, estimator = search_parts(cell)
-        available = {"value"} | ({"gradient"} if estimator is not None and estimator.gives_gradient else set())
+        available = {"value"} | ({"gradient"} if estimator is not None else set())
         missing = sorted(optimizer.needs - available)
         if missing:
             source = f"estimator {estimator.name}" if estimator is not None else f"scene {cell.scene.name}"
