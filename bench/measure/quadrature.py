@@ -186,12 +186,15 @@ def _integral(
     width, sigma = integrand.width, integrand.problem.sigma
     missed = _missed(integrand.excess, edges) / sigma if width > 1 or _has_settled(level, rounding) else 0.0
     allowed = min(level.error, TOLERANCE * level.norm) + SETTLED * level.norm + rounding + SOLVED * level.size
-    mean, error, used, power, doubts = level.mean, level.error, level.points, 0.0, [limits.note] if limits.note else []
-    if width == 1 and (missed > allowed or error > TOLERANCE * level.norm):
+    is_missing = missed > allowed
+    mean, error, used, power = level.mean, level.error, level.points, 0.0
+    if width == 1 and (is_missing or error > TOLERANCE * level.norm):
+        # halving only the panels that change resolves a narrow feature, which is then no longer missed
         ends = np.unique([*edges[0], *np.linspace(limits.low[0], limits.high[0], 2 * SEARCH[1])])
         value, error, used, power = _bisected(lambda t: t * integrand.excess(t[None, :]) / sigma, ends)
-        mean, missed = np.array([value]), 0.0
+        mean, is_missing = np.array([value]), False
     elif error > SETTLED * level.norm:
+        # an error that halving has not settled may be due to a pole, whose power shows on lines through the largest cost
         lines = [partial(integrand.along, level.peak, axis) for axis in np.eye(width)]
         power = max(_bisected(line, np.linspace(-1.0, 1.0, AROUND))[3] for line in lines)
     spacing = float(np.prod(limits.high - limits.low)) ** (1.0 / width) / used ** (1.0 / width)
@@ -200,9 +203,10 @@ def _integral(
         return integrand.unknown(
             f"the cost is infinite near theta = ({place}), a pole, so its mean may not exist", used, spacing
         )
+    doubts = [limits.note] if limits.note else []
     # the error falls as spacing^(1 - power), so a halving shows only a part of it
     error /= 2.0 ** (1.0 - power) - 1.0
-    if missed > allowed:
+    if is_missing:
         error += missed
         doubts.append("the cost has a feature narrower than the spacing of the points")
     if power >= HEAVY:

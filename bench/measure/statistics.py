@@ -219,11 +219,11 @@ def bias_interval(difference: np.ndarray, *errors: Sampling, level: float = 0.95
 
     limit = _student_quantile(0.5 + level / 2.0, 1.0 / doubt if doubt else math.inf)
     end = math.sqrt(total)
-    low = 0.0 if score(total, 0.0) <= limit else _bisect(limit, lambda beta: score(total, beta), 0.0, end)
+    low = 0.0 if score(total, 0.0) <= limit else _bisect(limit, lambda beta: score(total, beta), end)
     seen, end = max(total, 1.0), max(end, 1.0) + limit
     while score(seen, end) > -limit:
         end *= 2.0
-    high = _bisect(-limit, lambda beta: score(seen, beta), 0.0, end)
+    high = _bisect(-limit, lambda beta: score(seen, beta), end)
     return math.sqrt(max(0.0, total - 1.0)) * unit, low * unit, high * unit
 
 
@@ -237,11 +237,12 @@ def _noncentral_score(value: float, nu: float, noncentrality: float) -> float:
     return float(((value / first) ** h - centre) / (h * math.sqrt(2.0 * p) * (1.0 + 0.5 * m * p)))
 
 
-def _bisect(target: float, function: Callable[[float], float], low: float, high: float) -> float:
-    """Return where in ``[low, high]`` a decreasing function reaches ``target``, by 50 bisections.
+def _bisect(target: float, function: Callable[[float], float], high: float) -> float:
+    """Return where in ``[0, high]`` a decreasing function reaches ``target``, by 50 bisections.
 
     ``scipy.optimize.bisect`` needs a sign change at the ends, which rounding may remove, and returns other last digits.
     """
+    low = 0.0
     for _ in range(50):
         middle = 0.5 * (low + high)
         if function(middle) > target:
