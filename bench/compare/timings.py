@@ -4,7 +4,7 @@ The calls of one run share its load, clock and memory layout, so their spread do
 runs of *before* (``again=DIR,DIR``), K in all, the logarithms of a cell's times have a mean, and a variance that is pooled
 over all cells. A time changed if it leaves the prediction interval of one more run: the central 1 - 2 ALPHA of Student's t
 with K - 1 degrees of freedom, not more, since the cells of one run are not independent. It must also change by at least
-EFFECT. Two runs alone cannot show whether the machine or the code changed.
+TIME_EFFECT. Two runs alone cannot show whether the machine or the code changed.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ import pandas as pd
 from bench.compare.judging import Change
 from bench.report.text import duration
 
-EFFECT = 1.5
+TIME_EFFECT = 1.5
 """Smallest ratio at which a time counts as changed."""
 ALPHA = 1e-3
 """Significance level on each side."""
 RUNS = 3
 """Smallest number of runs of before, the first included, from which a spread is computed."""
 NOTE = (
-    f"With again=, a time counts if it changed by a factor of {EFFECT:g} or more and by more than the spread between runs of "
+    f"With again=, a time counts if it changed by a factor of {TIME_EFFECT:g} or more and by more than the spread between runs of "
     f"before (p < {2 * ALPHA:g} in Student's t)."
 )
 
@@ -55,7 +55,7 @@ def judge_times(
     remark = f"times of {n_unjudged} cells are not judged, since some run of before lacks the cell"
     # the standard deviation of a logarithmic time between runs, at least 5%
     spread = max(0.05, float(np.sqrt(complete.var(axis=1, ddof=1).mean())))
-    limit = max(math.log(EFFECT), float(stdtrit(count - 1, 1 - ALPHA)) * spread * math.sqrt(1 + 1 / count))
+    limit = max(math.log(TIME_EFFECT), float(stdtrit(count - 1, 1 - ALPHA)) * spread * math.sqrt(1 + 1 / count))
     growth = new[complete.index] - complete.mean(axis=1)
     changes = {
         key: Change(

@@ -15,7 +15,7 @@ from bench.model import Problem
 
 NODES = 8
 """Number of Gauss-Legendre nodes per panel."""
-REACH = 9.0
+LEAST_LIMIT = 9.0
 """Least limit of integration on either side, in standard deviations: beyond it, the normal density is below 1e-17."""
 NEAR, FARTHEST = 12.0, 38.0
 """Distances up to which the integrand is searched: the first, and where it has not vanished there, the second. Beyond the
@@ -274,7 +274,7 @@ class _Limits:
     @property
     def stretch(self) -> np.ndarray:
         """Distance of the limits per axis, relative to the least one, ``(width,)``."""
-        return (self.high - self.low) / (2.0 * REACH)
+        return (self.high - self.low) / (2.0 * LEAST_LIMIT)
 
 
 @dataclass(frozen=True)
@@ -304,7 +304,7 @@ class _Shells:
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = at_end / np.maximum(before, at_end)
             rest = np.where(at_end > VANISHED * float(self.mass.sum()), at_end * ratio / (1.0 - ratio), 0.0)
-        return float(rest[SPACING * (last.clip(0) + 1) >= REACH].sum())
+        return float(rest[SPACING * (last.clip(0) + 1) >= LEAST_LIMIT].sum())
 
 
 def _limits(excess: Callable[[np.ndarray], np.ndarray], width: int) -> _Limits:
@@ -315,8 +315,8 @@ def _limits(excess: Callable[[np.ndarray], np.ndarray], width: int) -> _Limits:
     """
     shells = _shells(excess, width)
     points, mass, total = shells.points, shells.mass, float(shells.mass.sum())
-    low, high = np.full(width, -REACH), np.full(width, REACH)
-    beyond = float(mass[np.abs(points).max(axis=0) > REACH].sum())
+    low, high = np.full(width, -LEAST_LIMIT), np.full(width, LEAST_LIMIT)
+    beyond = float(mass[np.abs(points).max(axis=0) > LEAST_LIMIT].sum())
     if beyond > NEGLIGIBLE * total:
         # what each point and all points farther out on its ray contribute
         rest = np.cumsum(mass[:, ::-1], axis=1)[:, ::-1]
@@ -326,7 +326,7 @@ def _limits(excess: Callable[[np.ndarray], np.ndarray], width: int) -> _Limits:
         is_outside = (points < low[:, None, None]) | (points > high[:, None, None])
         beyond = float(mass[is_outside.any(axis=0)].sum())
     unseen, nearest, note = shells.unseen(), SPACING * (shells.last.min() + 1), ""
-    if shells.ended.any() and nearest >= REACH:
+    if shells.ended.any() and nearest >= LEAST_LIMIT:
         note = f"costs beyond {nearest:g} standard deviations are not finite, so the mean may not exist"
     # with a larger share of the mass beyond the last finite points, the integral may not exist
     if unseen > 1e-3 * total:

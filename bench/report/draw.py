@@ -54,9 +54,9 @@ USELESS = 1e2
 """Where a value above 1 means a failure, larger values are drawn here with their number."""
 CUT = SIZE + 1
 """Height of the line of such a number, in points."""
-BESIDE = 2.5
+SHIFT = 2.5
 """Distance in points of the marks of a panel's lines at the same place."""
-SIGNS = dict(zip(MARKERS, "●■◆▲▼✚✖★", strict=True))
+LETTERS = dict(zip(MARKERS, "●■◆▲▼✚✖★", strict=True))
 """The letter that looks like each marker, before the number of a value beyond the axis."""
 HOLLOW: dict[str, Any] = {"markerfacecolor": "none"}
 NEAR = 20.0
@@ -381,7 +381,7 @@ def _draw_plot(axes: Axes, panel: Panel, _: float) -> None:
             style = replace(style, marker="")
         # marks on top of each other are all seen
         is_aside = chart.kind == "lines" and not (chart.line or chart.band) and style.marker != ""
-        shift = BESIDE * (order - (len(groups) - 1) / 2) * is_aside
+        shift = SHIFT * (order - (len(groups) - 1) / 2) * is_aside
         _draw_series(Series(axes, panel, style, rows[x].to_numpy(), shift), rows)
     if is_numeric:
         rows = chart.frame if chart.own_scales else panel.rows
@@ -497,7 +497,7 @@ def _draw_at_edge(series: Series, given: np.ndarray, is_beyond: np.ndarray, is_f
         label, at = number(given[largest]), series.places[largest]
         if label not in cuts:
             axes.annotate(
-                f"{SIGNS.get(series.style.marker, '')} {label}",
+                f"{LETTERS.get(series.style.marker, '')} {label}",
                 (at, 1) if is_plot else (1, at),
                 (0, 2 + CUT * len(cuts)) if is_plot else (2, -3),  # above those that are there
                 xycoords=edge,

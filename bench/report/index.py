@@ -25,7 +25,7 @@ YEAR_3000 = 32503680000.0
 """Seconds since 1970 that no run has stored."""
 GOOD = ("ok", "unsupported", "unavailable", "waiting")
 """Statuses that do not count as failures: the cell has a result, or was refused with a reason."""
-MARKERS = ("rows.parquet", "run.json", "answer.json")
+OWN_FILES = ("rows.parquet", "run.json", "answer.json")
 """Files whose folder is listed."""
 LISTED = (".html", ".md", ".csv", ".tex", ".png", ".svg", ".pdf")
 """Suffixes of the files that a card lists."""
@@ -38,9 +38,9 @@ def write(folder: Path) -> Path:
     """
     if not folder.is_dir():
         raise UserError(f"'{folder}' is not a folder")
-    places = sorted({path.parent for name in MARKERS for path in folder.rglob(name)})
+    places = sorted({path.parent for name in OWN_FILES for path in folder.rglob(name)})
     if not places:
-        raise UserError(f"'{folder}' has no experiments: no {', no '.join(MARKERS)} below it")
+        raise UserError(f"'{folder}' has no experiments: no {', no '.join(OWN_FILES)} below it")
     title = f"Results in {folder.name or folder.resolve().name}"
     notes = [f"<p>{counted(len(places), 'experiment')}.</p>"]
     if any(_page(place) is None for place in places):

@@ -71,7 +71,7 @@ BIAS = Column(
 COST = interval("cost", log=False, ends="95% of the rollouts", doc="costs of the same rollouts")
 SECONDS = replace(COLUMNS.by_name["time_s"], label="time of one estimate", log=True)
 FASTEST = "each estimator on its fastest backend"
-ESTIMATOR = text("series", label="")
+SERIES = text("series", label="")
 
 
 def charts(
@@ -357,7 +357,7 @@ def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Cha
             cell=frame["sign"] + frame["cost"].map(short_duration),
         ),
         [text("problem", label="")],
-        [ESTIMATOR],
+        [SERIES],
         "grid",
         panel="panel",
         level="grade",
@@ -396,7 +396,7 @@ def _estimators(methods: pd.DataFrame) -> Chart:
             cell=(frame["error_is_limit"].map({True: "<"}).fillna("") + error.map(number)).where(known, marks),
         ),
         [text("problem", label="")],
-        [ESTIMATOR],
+        [SERIES],
         "grid",
         panel="panel",
         level="grade",

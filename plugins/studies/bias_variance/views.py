@@ -98,7 +98,7 @@ FAILURES = {
 """Sign and meaning of each status other than ``ok``."""
 REMARKED = "?"
 """Mark of a cell whose row has a remark."""
-LEAST = 3
+FEWEST_RANKED = 3
 """Fewest estimators for which the ranking is written; the main table is enough for fewer."""
 ESTIMATOR = text("method", label="estimator")
 
@@ -117,7 +117,7 @@ def tables(
     ``equal`` has the methods at equal rollouts, ``best`` is the table of the cost to reach an error.
     """
     main, *others = pivoted
-    is_ranked = methods["estimator"].nunique() >= LEAST and methods["problem"].nunique() > 1
+    is_ranked = methods["estimator"].nunique() >= FEWEST_RANKED and methods["problem"].nunique() > 1
     names = {name: errors[name].map(", ".join) for name in ("tied", "not_comparable")}
     joined = errors.drop(columns=["setting", "leaders"]).assign(**names)
     columns = [replace(c, note="factor_note") if c.name == "factor" else c for c in COMPARED]

@@ -25,7 +25,7 @@ from .. import PARTS
 
 TARGETS = (10.0, 100.0, 1000.0)
 """Target regrets: the first regret divided by each of these factors."""
-ROUNDING = 1e-12
+LEAST_REGRET = 1e-12
 """Smallest regret, as a share of the first regret: a smaller regret is rounding."""
 
 
@@ -158,7 +158,7 @@ def hits(runs: RunSet) -> pd.DataFrame:
         spent = np.asarray(row["path_rollouts"], dtype=float) + row["ratio"] * np.asarray(
             row["path_gradients"], dtype=float
         )
-        rounding = ROUNDING * max(abs(row["start_cost"] - row["best_known"]), 1e-300)
+        rounding = LEAST_REGRET * max(abs(row["start_cost"] - row["best_known"]), 1e-300)
         regret = np.maximum(np.asarray(row["path_cost"], dtype=float) - row["best_known"], rounding)
         for target in TARGETS:
             below = np.flatnonzero(regret <= regret[0] / target)
