@@ -153,22 +153,9 @@ def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:
         along, problem = level[["axis", "problem"]].iloc[0]
         is_swept = along == "samples"
         of = methods[(methods["axis"] == along) & (methods["problem"] == problem)] if is_swept else level
-        spent = of["rollouts"].where(of["rollouts"] > 0)
-        least = level.loc[~level["has_fixed_work"], "rollouts"].min()
-        names, law, each = pd.factorize(of["method"])[0], of["has_law"].to_numpy(bool), spent.to_numpy()
-        apart = {
-            cost: np.where(law | (each <= SAME_COST * cost), np.abs(np.log(each / cost)), math.inf)
-            for cost in sorted(level["rollouts"].unique())
-            if cost > 0 and not cost < least
-        }
-        same = {cost: (distance <= math.log(SAME_COST)) | (~law & (each <= cost)) for cost, distance in apart.items()}
-        order = 1 if is_swept else -1
-        cost = max(same, key=lambda c: (np.unique(names[same[c] | law]).size, order * c), default=math.nan)
-        distances = pd.Series(apart.get(cost), of.index, float).fillna(math.inf)
-        nearest = of.loc[distances.groupby(of["method"], sort=False).idxmin()] if apart else level
-        scale = (spent / cost).where(of["has_law"]).mask(same[cost], 1.0) if apart else spent
-        found = nearest.assign(rollouts=cost, scale=scale, share=spent / cost)
+        found = _at_common_rollouts(level, of, is_swept)
         if is_swept:
+            cost = found["rollouts"].iloc[0]
             found = found.assign(setting=f"{problem}; rollouts {cost:.3g}", axis="rollouts", at=float(f"{cost:.3g}"))
         parts.append(found)
     found = pd.concat(parts).drop_duplicates(["setting", "method"], ignore_index=True)
@@ -178,6 +165,35 @@ def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:
     # cost. A fitted model may become exact
     found["error_low"] *= (share**2.0).fillna(1.0).mask(found["is_fitted"] & (share < 1.0), 0.0)
     return found
+
+
+def _at_common_rollouts(level: pd.DataFrame, of: pd.DataFrame, prefers_most: bool) -> pd.DataFrame:
+    """Return the row of each method that is nearest to the rollouts at which most methods of a ``level`` are known.
+
+    The row is one ``of`` the problem's rows. ``share`` are its rollouts over these, and ``scale`` is the factor on its variance:
+    1 where it is known as measured, NaN where its error is not known.
+    """
+    least = level["rollouts"][~level["has_fixed_work"]].min()
+    costs = level["rollouts"][(level["rollouts"] > 0) & ~(level["rollouts"] < least)].unique()
+    if not costs.size:
+        return level.assign(rollouts=math.nan, scale=math.nan, share=math.nan)
+    spent, has_law = of["rollouts"].where(of["rollouts"] > 0), of["has_law"].astype(bool)
+
+    def distance(cost: float) -> pd.Series:
+        """Return how far each row is from some rollouts, as a logarithm; infinite where its error says nothing there."""
+        return np.log(spent / cost).abs().where(has_law | (spent <= SAME_COST * cost), math.inf)
+
+    def is_measured(cost: float) -> pd.Series:
+        """Return whether a row has these rollouts or, where no law gives its error at others, fewer."""
+        return (distance(cost) <= math.log(SAME_COST)) | (~has_law & (spent <= cost))
+
+    def n_known(cost: float) -> int:
+        return int(of["method"][is_measured(cost) | has_law].nunique())
+
+    cost = max(sorted(costs), key=lambda cost: (n_known(cost), cost if prefers_most else -cost))
+    nearest = distance(cost).fillna(math.inf).groupby(of["method"], sort=False).idxmin()
+    scale = (spent / cost).where(has_law).mask(is_measured(cost), 1.0)
+    return of.loc[nearest].assign(rollouts=cost, scale=scale, share=spent / cost)
 
 
 def _scaled(methods: pd.DataFrame, scale: pd.Series) -> pd.DataFrame:
