@@ -201,50 +201,49 @@ def largest_jump(
     at these nodes, and jumps in an interval whose second difference more than 32 other intervals exceed.
     Values that are not finite are ignored.
     """
-    count = starts.shape[1]
-    line = np.arange(count)
-    left, width = np.zeros(count), 1.0
-    span = noise = size = 0.0
+    line = np.arange(starts.shape[1])
+    left, width = np.zeros(line.size), 1.0
+    span = size = 0.0
     single = True
     while True:
         nodes = left[:, None] + width * np.linspace(0.0, 1.0, parts + 1)
-        at = np.repeat(line, parts + 1)
-        places, held = nodes.ravel(), max(1, MOST_POINTS // len(starts))
-        values = np.concatenate(
-            [
-                cost(starts[:, part] + (ends[:, part] - starts[:, part]) * places[i : i + held])
-                for i, part in ((i, at[i : i + held]) for i in range(0, len(at), held))
-            ]
-        ).reshape(nodes.shape)
-        values = np.where(np.isfinite(values), values, np.nan)
-        if not np.isfinite(values).any():
-            return Jump(0.0, span)
+        values = _costs_at(cost, starts[:, line], ends[:, line], nodes)
         known = values[np.isfinite(values)]
+        if not known.size:
+            return Jump(0.0, span)
         single = single and bool((known == known.astype(np.float32)).all())
         size = max(size, float(np.abs(known).max()))
-        span = max(span, float(np.nanmax(values) - np.nanmin(values)))
-        steps = np.nan_to_num(np.abs(np.diff(values, axis=1)))
-        highest, part = np.unravel_index(int(steps.argmax()), steps.shape)
-        where = int(line[highest]), float(nodes[highest, part : part + 2].mean())
+        span = max(span, float(np.ptp(known)))
         bends = np.nan_to_num(np.abs(np.diff(values, 2, axis=1)))
         if width / parts < FINEST:
-            # at this length only a jump exceeds rounding
-            noise = float(np.median(bends))
-            isolated = _isolated(values, steps)
-            best = int(np.argmax(isolated))
-            at_jump = int(steps[best].argmax())
-            where = int(line[best]), float(nodes[best, at_jump : at_jump + 2].mean())
-            change = float(isolated[best])
             break
         row, place = np.unravel_index(np.argsort(bends, axis=None)[-32:], bends.shape)
         # the 32 most suspicious intervals and their neighbours are divided into as many at every further level
         line, left, width, parts = line[row], nodes[row, place], 2.0 * width / parts, 32
-    if single:
-        # steps of rounding are flat at the last level, so that they have no median bend
-        noise = max(noise, SINGLE * size)
+    # at this length only a jump exceeds rounding, whose steps are flat in single precision, so that they have no median bend
+    noise = max(float(np.median(bends)), SINGLE * size * single)
+    steps = np.nan_to_num(np.abs(np.diff(values, axis=1)))
+    isolated = _isolated(values, steps)
+    best = int(np.argmax(isolated))
+    at, change = int(steps[best].argmax()), float(isolated[best])
     # below this share of the range of the cost on the lines rounding may hide that a change still shrinks
     is_jump = change > max(1e-6 * span, LOUD * noise)
-    return Jump(change if is_jump else 0.0, span, *where)
+    return Jump(change if is_jump else 0.0, span, int(line[best]), float(nodes[best, at : at + 2].mean()))
+
+
+def _costs_at(
+    cost: Callable[[np.ndarray], np.ndarray], starts: np.ndarray, ends: np.ndarray, nodes: np.ndarray
+) -> np.ndarray:
+    """Return the costs ``(L, P)`` at shares ``nodes`` of the way from ``starts (n, L)`` to ``ends``; NaN where not finite."""
+    line, share = np.repeat(np.arange(len(nodes)), nodes.shape[1]), nodes.ravel()
+    held = max(1, MOST_POINTS // len(starts))
+    blocks = [slice(i, i + held) for i in range(0, share.size, held)]
+    values = [
+        cost(starts[:, line[block]] + (ends[:, line[block]] - starts[:, line[block]]) * share[block])
+        for block in blocks
+    ]
+    costs = np.concatenate(values).reshape(nodes.shape)
+    return np.where(np.isfinite(costs), costs, np.nan)
 
 
 def _isolated(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
