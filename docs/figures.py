@@ -11,7 +11,6 @@ definitions, settings or published by others has ``<!-- figures: given -->``.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable
 from functools import cache
@@ -64,8 +63,7 @@ def block(lines: list[str]) -> str:
 @cache
 def speeds() -> dict[str, float]:
     """Return the lines of the stored run of ``bench_self`` by name."""
-    lines = json.loads((STANDARD / "bench_self" / "bench_self.json").read_text())["lines"]
-    return {line["what"]: line["value"] for line in lines if line["value"] is not None}
+    return dict(table_of("bench_self/bench_self").set_index("what")["value"])
 
 
 BATCHES = ("1000", "10000", "100000", "1e+06")
@@ -296,6 +294,22 @@ PLACES = {"start": '0", at<=3000', "later": '0.9", at<=3000', "beyond": '0", at=
 UPPER = ("plain", "difference", "pairs")
 
 
+SPEEDS = {
+    "jax": "jax grad over by hand, 100 rollouts",
+    "torch": "torch grad over by hand, 100 rollouts",
+    "numpy": "numpy value over by hand, 100 rollouts",
+    "sweep": "a sweep over by hand",
+    "by-hand": "a sweep by hand",
+    "cell": "overhead of a cell",
+    "plan": "planning 10000 cells",
+    "resume": "resuming 10000 stored cells",
+    "list": "python -m bench list",
+}
+"""Lines of ``bench_self`` by the end of their figures' names."""
+BEFORE = ("jax", "torch", "numpy", "sweep")
+"""Those whose first stored values are figures too."""
+
+
 FIGURES: dict[str, str | Callable[[], str]] = {
     **{
         f"{name}-{place}": f'{NEAR}{where}, estimator="{estimator}" | {"error_high | most" if name in UPPER and place != "beyond" else "error"}'
@@ -323,7 +337,11 @@ FIGURES: dict[str, str | Callable[[], str]] = {
     "dose-costs": lambda: dose_classes({cost: f"{ROLLOUTS}{cost}" for cost in ("1", "2", "4", "measured")}),
     **{f"trust-{name}": trust_figure(name, "fobg") for name in ("cells", "trusted", "others", "missed")},
     **{f"trust-all-{name}": trust_figure(name, *FOUR) for name in ("cells", "trusted", "wrong")},
-    "speed-cell": lambda: number(speeds()["overhead of a cell"]),
+    **{
+        f"{run}-{name}": f'bench_self/{run} | what="{what}" | value'
+        for name, what in SPEEDS.items()
+        for run in ("before", "bench_self")[name not in BEFORE :]
+    },
     "speed-rollouts": rollouts_table,
     "speed-overhead": overhead_table,
     "speed-scenes": lambda: span(
@@ -331,15 +349,9 @@ FIGURES: dict[str, str | Callable[[], str]] = {
     ),
     "speed-bounce": lambda: span(speed("fused over jax, bounce_once, * rollouts")),
     "speed-over-c": lambda: span(over_c("fused grad, penalty")),
-    "speed-sweep": lambda: number(speeds()["a sweep by the harness"]),
-    "speed-sweep-by-hand": lambda: number(speeds()["a sweep by hand"]),
-    "speed-sweep-ratio": lambda: number(speeds()["a sweep by the harness"] / speeds()["a sweep by hand"]),
     "speed-agree": numbers_agree,
     "speed-memory-fused": lambda: span(speed("fused grad, penalty, * rollouts: peak memory"), 3),
     "speed-memory-jax": lambda: span(speed("jax grad, penalty, * rollouts: peak memory"), 3),
-    "speed-plan": lambda: number(speeds()["planning 10000 cells"]),
-    "speed-resume": lambda: number(speeds()["resuming 10000 stored cells"]),
-    "speed-list": lambda: number(speeds()["python -m bench list"]),
 }
 
 

@@ -1,6 +1,6 @@
 """Measures the harness and its backends beside programs written by hand: ``python validation/bench_self.py [FOLDER [PART...]]``.
 
-Times are processor times of calls on one thread: other load changes their ratios little. Writes ``FOLDER/bench_self.json`` (by default in
+Times are processor times of calls on one thread: other load changes their ratios little. Writes ``FOLDER/bench_self.csv`` (by default in
 ``results/bench_self``), from which ``docs/speed.md`` is written. With names of parts, such as ``overhead``, only these are
 measured, and the other lines of the file stay.
 """
@@ -17,6 +17,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from speed import by_hand, native
 
 from bench.experiment import config
@@ -161,6 +162,7 @@ def measure_sweep():
     yield "a sweep: largest relative difference", max(differences), ""
     yield "a sweep by hand", by_hand_s, "s"
     yield "a sweep by the harness", harness_s, "s"
+    yield "a sweep over by hand", harness_s / by_hand_s, ""
 
 
 def measure_commands(side, count):
@@ -209,16 +211,14 @@ def main(words):
     """Measure, print and write the speeds."""
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # one thread in all libraries, which are imported later
     folder, parts = Path(*words[:1] or ["results/bench_self"]), words[1:]
-    path = folder / "bench_self.json"
-    conditions = {"machine": machine(), "load_average_before": os.getloadavg()}
-    record = json.loads(path.read_text()) if parts else conditions | {"lines": []}
-    lines = {line["what"]: line for line in record["lines"]}
+    path = folder / "bench_self.csv"
+    lines = pd.read_csv(path, index_col="what").to_dict("index") if parts else {}
     for what, value, unit in itertools.chain.from_iterable(PARTS[part]() for part in parts or PARTS):
         print(f"{what}: {value:.3g} {unit}", flush=True)
-        lines[what] = {"what": what, "value": float(value), "unit": unit}
-    record |= {part: conditions for part in parts} | {"lines": list(lines.values())}
+        lines[what] = {"value": float(value), "unit": unit, "load": os.getloadavg()[0]}
     folder.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(record, indent=1) + "\n")
+    pd.DataFrame.from_dict(lines, "index").rename_axis("what").to_csv(path, float_format="%.6g")
+    (folder / "machine.json").write_text(json.dumps(machine(), indent=1) + "\n")
 
 
 if __name__ == "__main__":

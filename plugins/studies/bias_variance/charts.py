@@ -151,14 +151,13 @@ def _along(shown: Arranged, axis: Axis) -> Chart | None:
     compares = shown.experiment.compares
     compared = next((column for column in ("backend", "contact") if f"{column}s" in compares), "")
     series = compares.get(f"{compared}s", ())
-    frame = pd.concat([_lines(problem, compared, series) for problem in problems], ignore_index=True)
+    rows = attempted(pd.concat([problem.rows for problem in problems]))
+    labels = (rows[_is_named(rows[compared], series)] if compared else rows)["series"].unique()
     # most estimators of a chart along an axis, where the experiment does not name them
-    names = compares.get("estimators") or [*frame["label"].unique()[:6]]
-    total = frame["label"].nunique()
-    shares = [f"{len(names)} of {total} estimators"] * (len(names) < total)
-    for column, kept in (("label", names), ("problem", [problem.title() for problem in drawn])):
-        frame = frame[frame[column].isin(kept)]
-        frame = frame.iloc[frame[column].map(kept.index).argsort(kind="stable")]
+    names = compares.get("estimators") or [*labels[:6]]
+    shares = [f"{len(names)} of {len(labels)} estimators"] * (len(names) < len(labels))
+    lines = [_lines(problem, compared, series).set_index("label", drop=False) for problem in drawn]
+    frame = pd.concat([each.loc[[name for name in names if name in each.index]] for each in lines], ignore_index=True)
     notes += ["backends that agree lie on each other"] * (compared == "backend")
     of_steps = frame[frame["horizon"].notna() & (axis.unit == "steps")]
     marks = [Mark(f"beyond the {name}", value, math.inf) for name, value in shown.marks(axis).items()]

@@ -212,14 +212,12 @@ def _scaled(methods: pd.DataFrame, scale: pd.Series) -> pd.DataFrame:
 
 def lowest(equal: pd.DataFrame) -> set[tuple[str, str]]:
     """Return the settings and methods whose interval at equal rollouts lies below that of every other estimator."""
-    found = set()
-    for key, level in equal[equal["status"] == "ok"].groupby("setting", sort=False):
-        rows = level.to_records()
-        for row in rows[~rows.error_is_limit]:
-            rivals = rows.error_low[rows.estimator != row.estimator]
-            if len(rivals) and (rivals > row.error_high).all():
-                found.add((str(key), str(row.method)))
-    return found
+    return {
+        (row.setting, row.method)
+        for level in _by_setting(equal[equal["status"] == "ok"])
+        for row in level[~level.error_is_limit]
+        if len(rivals := level.error_low[level.estimator != row.estimator]) and (rivals > row.error_high).all()
+    }
 
 
 def verdict(status: Any, error: Any, low: Any, high: Any, is_zero: Any = False) -> Any:
@@ -255,8 +253,13 @@ def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
     first and those tied with it whose error is near.
     """
     names = [*SETTING, "not_comparable", "first", *VALUE, "second", *FACTOR, "tied", "leaders"]
-    lines = [_compared(level.to_records()) for _, level in methods.groupby("setting", sort=False)]
-    return pd.DataFrame(lines, columns=names)
+    return pd.DataFrame(map(_compared, _by_setting(methods)), columns=names)
+
+
+def _by_setting(methods: pd.DataFrame) -> list[np.recarray]:
+    """Return the methods at each setting, in order of appearance; all are converted at once, since that is slow."""
+    records = methods.to_records()
+    return [records[places] for places in methods.groupby("setting", sort=False).indices.values()]
 
 
 def _compared(level: np.recarray) -> dict[str, Any]:
