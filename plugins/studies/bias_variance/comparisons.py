@@ -190,7 +190,7 @@ def _at_common_rollouts(level: pd.DataFrame, of: pd.DataFrame, prefers_most: boo
     def n_known(cost: float) -> int:
         return int(of["method"][is_measured(cost) | has_law].nunique())
 
-    cost = max(sorted(costs), key=lambda cost: (n_known(cost), cost if prefers_most else -cost))
+    cost = max(costs, key=lambda cost: (n_known(cost), cost if prefers_most else -cost))
     nearest = distance(cost).fillna(math.inf).groupby(of["method"], sort=False).idxmin()
     scale = (spent / cost).where(has_law).mask(is_measured(cost), 1.0)
     return of.loc[nearest].assign(rollouts=cost, scale=scale, share=spent / cost)
