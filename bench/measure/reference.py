@@ -140,9 +140,8 @@ def transferred(reference: Reference, problem: Problem, other: Problem, samples:
         with np.errstate(all="ignore"):
             mine, others = problem.value(theta, w), other.value(theta, w)
             spread = np.ptp(mine[np.isfinite(mine)]) if np.isfinite(mine).any() else 0.0
-            # difference between two backends' costs of one draw, relative to the range of costs, that rounding
-            # explains. The root of the coarser unit roundoff is allowed too, and 100 roundoffs of the cost
-            # itself
+            # rounding explains a difference of 1e-6 of the range of costs, or the root of the coarser unit roundoff if that
+            # is more, and 100 roundoffs of the cost itself
             allowed = max(1e-6, math.sqrt(unit)) * spread + 100.0 * unit * np.abs(mine)
             agrees = (mine == others) | (np.abs(others - mine) <= allowed) | (np.isnan(mine) & np.isnan(others))
             share += float(1.0 - agrees.mean()) / blocks

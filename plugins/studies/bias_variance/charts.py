@@ -152,7 +152,7 @@ def _along(shown: Arranged, axis: Axis) -> Chart | None:
     compared = next((column for column in ("backend", "contact") if f"{column}s" in compares), "")
     series = compares.get(f"{compared}s", ())
     frame = pd.concat([_lines(problem, compared, series) for problem in problems], ignore_index=True)
-    # most estimators of a chart along an axis, where the experiment does not name them
+    # where the experiment names no estimators, a chart along an axis has the first six
     names = compares.get("estimators") or [*frame["label"].unique()[:6]]
     total = frame["label"].nunique()
     shares = [f"{len(names)} of {total} estimators"] * (len(names) < total)
@@ -377,7 +377,7 @@ def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Cha
 
 def _estimators(methods: pd.DataFrame) -> Chart:
     """Return the heat table of errors: estimators by their worst case, in families, against problems."""
-    # of an axis the first value is shown
+    # the first value of an axis is shown
     methods = methods.drop_duplicates(["estimator", "problem"])
     worst = methods["error"].where(methods["status"] == "ok", math.inf).groupby(methods["estimator"]).transform("max")
     frame = methods.loc[worst.sort_values(kind="stable").index]
@@ -423,7 +423,7 @@ def _family(estimator: str) -> str:
     entry = registry.entries()["estimators"].get(estimator)
     plugin: Any = entry and entry.plugin
     needs = getattr(plugin, "needs", None)
-    # of an estimator whose parameters decide what it needs there is no set
+    # an estimator whose parameters decide what it needs has a property here, not a set
     if not isinstance(needs, frozenset) or "grad" not in needs:
         return "costs only"
     if needs == {"grad"}:
