@@ -69,7 +69,7 @@ def judge_cell(columns: Columns, old: Row | None, new: Row | None) -> list[Chang
         return [_whole(was, now, _remark(new))]
     if was != "ok":
         return []
-    # of equal estimates only the reference can differ, which makes them neither better nor worse
+    # if the estimates are equal, only the reference can differ, which makes them neither better nor worse
     pairs = (_pair(rule_of(column), old, new) for column in columns.compared)
     are_same, doubt = any(pair and pair.is_same for pair in pairs), _doubt(old, new)
     changes = _lost(columns, old, new)

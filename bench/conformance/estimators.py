@@ -47,6 +47,8 @@ DESIGNS: tuple[tuple[int, dict[str, Any]], ...] = (
     (16, {"draws": "sobol"}),
 )
 """Numbers of samples and designs of the noise that are checked."""
+DESIGNED = 4
+"""Number of oracles of such a check."""
 
 
 class RecordingProblem(Problem):
@@ -355,7 +357,7 @@ def bias_under_every_design(estimator: Estimator) -> str:
     skip_unless(estimator.unbiased and estimator.target == "smoothed", "declares a bias, or another target")
     candidates = usable(estimator, [o for o in oracles() if o.program.continuous])
     # in few dimensions, bias stands out
-    candidates = sorted(candidates, key=lambda oracle: oracle.problem.dim)[:4]
+    candidates = sorted(candidates, key=lambda oracle: oracle.problem.dim)[:DESIGNED]
     details = []
     for count, given in DESIGNS:
         method = dataclasses.replace(estimator, **given)

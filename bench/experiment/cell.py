@@ -208,7 +208,7 @@ class Cell:
     def columns(self) -> dict[str, Any]:
         """Return the identity columns of the cell's row, from its parameters and counts."""
         law = self.contact
-        smoothing = getattr(law, law.smoothing) if law is not None and law.smoothing else math.nan
+        smoothing = getattr(law, law.smoothing) if law and law.smoothing else math.nan
         return {
             **labels(self.parameters),
             "noise": "parameter" if self.decision.names else self.scene.noise,

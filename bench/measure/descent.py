@@ -166,7 +166,7 @@ def _followed(objective: _Objective, theta: np.ndarray, w: np.ndarray) -> tuple[
         # the last steps have gained a negligible share of the whole gain
         if len(path.costs) > 10 and path.costs[-11] - reached < 1e-3 * (path.costs[0] - reached):
             break
-        # most steps, and the distance of theta from 0, relative to that length, from which costs count as unbounded below
+        # after 400 steps, or a thousand times that length away, costs count as unbounded below
         if len(path.costs) > 400 or np.linalg.norm(new) > 1e3 * scale:
             return path, False
     return path, True

@@ -127,8 +127,7 @@ def missed_slope(problem: Problem, theta: np.ndarray, seed: int, columns: int) -
         largest = max(np.nanmax(np.abs(part.sum(axis=1)), initial=0.0) for part in (by_costs, by_gradients))
         unit = SINGLE if (costs == costs.astype(np.float32)).all() else float(np.finfo(np.float64).eps)
         noise = LOUD * unit * np.abs(costs).max(axis=1)
-        # largest difference between the sums over every other point, relative to the missed slope, at which the
-        # sums decide
+        # the sums decide if those over every other point differ little, relative to the missed slope
         is_shown = (np.abs(missed) > noise) & (doubts[1] <= 0.25 * np.abs(missed)) & (doubts[0] <= np.abs(missed))
         shares = np.where(is_shown, np.abs(missed) / largest, 0.0)
     line = int(np.argmax(shares))
@@ -255,7 +254,6 @@ def _isolated(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
     rest = steps.copy()
     rest[row, part] = 0.0
     sides = np.maximum(np.abs(values[row, part] - values[:, 0]), np.abs(values[:, -1] - values[row, part + 1]))
-    # largest change of the cost beside a jump, relative to the jump. Beside a root or in chaos the changes are
-    # of one size
+    # beside a jump the cost changes by at most a tenth of it; beside a root or in chaos all changes are of one size
     allowed = 0.1 * steps[row, part]
     return np.where((rest.max(axis=1) <= allowed) & (np.nan_to_num(sides) <= allowed), steps[row, part], 0.0)

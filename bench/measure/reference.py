@@ -140,9 +140,8 @@ def transferred(reference: Reference, problem: Problem, other: Problem, samples:
         with np.errstate(all="ignore"):
             mine, others = problem.value(theta, w), other.value(theta, w)
             spread = np.ptp(mine[np.isfinite(mine)]) if np.isfinite(mine).any() else 0.0
-            # difference between two backends' costs of one draw, relative to the range of costs, that rounding
-            # explains. The root of the coarser unit roundoff is allowed too, and 100 roundoffs of the cost
-            # itself
+            # rounding explains a difference of 1e-6 of the range of costs, or the root of the coarser unit roundoff if that
+            # is more, and 100 roundoffs of the cost itself
             allowed = max(1e-6, math.sqrt(unit)) * spread + 100.0 * unit * np.abs(mine)
             agrees = (mine == others) | (np.abs(others - mine) <= allowed) | (np.isnan(mine) & np.isnan(others))
             share += float(1.0 - agrees.mean()) / blocks
@@ -455,15 +454,11 @@ class _Sampler:
         with np.errstate(over="ignore", invalid="ignore"):
             deep = np.where(weight > 0.0, at(side * depth) * weight, 0.0)
             sizes = np.abs(deep).max(axis=0)
-        for first in (0, 1):  # either sign of the depth
-            for ray in sizes[:, first::2]:
-                if np.isfinite(ray).all():
-                    continue
-                # the ray ends before its terms begin to diverge
-                finite = ray[: int(np.argmin(np.isfinite(ray)))]
-                end = finite.size - int(np.argmin(finite[::-1])) if finite.size else 0
+        for sign in (0, 1):
+            for ray in sizes[:, sign::2]:
+                finite, end = _convergent_part(ray)
                 if finite[end:].sum() > max(error, finite[:end].sum()):
-                    limit = depth[first::2][end - 1]
+                    limit = depth[sign::2][end - 1]
                     note = f"rollouts beyond {limit:.2g} standard deviations diverge, so the mean may not exist"
                 ray[end:] = 0.0
         deep = np.where(sizes > 0.0, deep, 0.0).sum(axis=2)
@@ -486,6 +481,15 @@ class _Sampler:
             return mean
         step = problem.directions(sides[0])
         return mean - (linear @ step) * step + linear[:, None]
+
+
+def _convergent_part(ray: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the finite first sizes ``(k,)`` of terms on a ray, and how many come before they begin to grow; all if all are finite."""
+    is_finite = np.isfinite(ray)
+    if is_finite.all():
+        return ray, ray.size
+    finite = ray[: np.argmin(is_finite)]
+    return finite, finite.size - int(np.argmin(finite[::-1])) if finite.size else 0
 
 
 def _directions(effect: np.ndarray) -> np.ndarray:

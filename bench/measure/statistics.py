@@ -192,7 +192,7 @@ def bias_interval(difference: np.ndarray, *errors: Sampling, level: float = 0.95
     if trace <= 1e-32 * observed or trace == 0.0:  # noise below the last digit of m
         return (math.sqrt(observed),) * 3
 
-    # in units of tr S from here on
+    # from here on all numbers are in units of tr S
     unit = math.sqrt(trace)
     errors = tuple(error.over(unit) for error in errors)
     difference = difference / unit
@@ -412,7 +412,7 @@ def summarise(
     if finite < repeats:
         return _not_finite(truth, finite / repeats, f"{repeats - finite} of {repeats} estimates are not finite")
 
-    # in units of the largest entry, so that squares of very large or small gradients do not overflow or underflow
+    # numbers are in units of the largest entry, so that squares of very large or small gradients do not overflow or underflow
     unit = max(float(np.abs(part).max(initial=0.0)) for part in (estimates, truth.mean, truth.sampling.rows)) or 1.0
     estimates, reference = estimates / unit, truth.over(unit)
     identical = (np.abs(estimates - estimates[0]) <= ROUNDING * np.abs(estimates[0])).all()
@@ -562,7 +562,7 @@ def _interval_remarks(deviations: np.ndarray, difference: np.ndarray, missed: fl
             "all estimates are identical: the intervals allow for an event of the gradient's size, rarer than about "
             f"{missed:.2g} per sample, which these samples would miss"
         ]
-    # fewest repeats for a test of tails; a note reports fewer
+    # a test of tails needs 8 repeats
     if repeats < 8:
         return [f"only {repeats} repeats: intervals are wide, and tails are not tested"]
     for part, where in ((deviations, ""), ((deviations @ difference)[:, None], " along the bias")):

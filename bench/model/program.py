@@ -351,8 +351,7 @@ class Rollout(Program):
         """Whether the initial state depends on theta, tested at theta0 and at random thetas near and far from it."""
         draw = np.random.default_rng(0)
         theta = self.scene.theta0()[:, None]
-        # number of random thetas per perturbation size at which the initial state is compared with the one at
-        # theta0
+        # the initial state is compared with that of theta0 at eight random thetas of each size
         sizes = np.repeat([1e-3, self.scene.sigma, 1.0 + float(np.abs(theta).max(initial=0.0))], 8)
         moved = np.concatenate([theta, theta + sizes * draw.standard_normal((theta.size, sizes.size))], axis=1)
         with np.errstate(all="ignore"):

@@ -16,7 +16,7 @@ from bench.experiment.views import Chart, Style
 from bench.model import registry
 from bench.report.style import VARIANTS, colour, marker
 
-BESIDE = (7, 4, 3, 2, 1, 6, 5, 0)
+ORDER_OF_OTHERS = (7, 4, 3, 2, 1, 6, 5, 0)
 """Places in the palette of trainers and of searches by costs: first those that few estimators have, since both share charts."""
 
 
@@ -57,13 +57,13 @@ def graded(
 def estimator_style(estimator: str, variant: int = 0) -> Style:
     """Return the look of an estimator, a trainer or a search by costs, with a marker and dashes for each of its variants, from 0.
 
-    Estimators have the colours of the palette in its order, the others in that of :data:`BESIDE`.
+    Estimators have the colours of the palette in its order, the others in that of :data:`ORDER_OF_OTHERS`.
     """
     others, names = searches(), order_of("estimators")
     place = names.index(estimator) if estimator in names else len(names)
     if estimator in others:
         place = others.index(estimator)
-        place = BESIDE[place] if place < len(BESIDE) else place
+        place = ORDER_OF_OTHERS[place] if place < len(ORDER_OF_OTHERS) else place
     return Style(colour(place), marker(place, variant), VARIANTS[variant % len(VARIANTS)])
 
 

@@ -54,7 +54,7 @@ USELESS = 1e2
 """Where a value above 1 means a failure, larger values are drawn here with their number."""
 CUT = SIZE + 1
 """Height of the line of such a number, in points."""
-SHIFT = 2.5
+BESIDE = 2.5
 """Distance in points of the marks of a panel's lines at the same place."""
 LETTERS = dict(zip(MARKERS, "●■◆▲▼✚✖★", strict=True))
 """The letter that looks like each marker, before the number of a value beyond the axis."""
@@ -381,7 +381,7 @@ def _draw_plot(axes: Axes, panel: Panel, _: float) -> None:
             style = replace(style, marker="")
         # marks on top of each other are all seen
         is_aside = chart.kind == "lines" and not (chart.line or chart.band) and style.marker != ""
-        shift = SHIFT * (order - (len(groups) - 1) / 2) * is_aside
+        shift = BESIDE * (order - (len(groups) - 1) / 2) * is_aside
         _draw_series(Series(axes, panel, style, rows[x].to_numpy(), shift), rows)
     if is_numeric:
         rows = chart.frame if chart.own_scales else panel.rows

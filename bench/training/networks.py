@@ -18,7 +18,7 @@ def normalised_elu(x: Array) -> Array:
     Without it, one seed in five of SHAC ends lower on the cart-pole.
     """
     x = jax.nn.elu(x)
-    # added to the variance of a hidden layer, so that equal outputs do not divide by 0
+    # the addition to the variance keeps a layer of equal outputs from a division by 0
     return (x - x.mean(axis=0)) / jnp.sqrt(x.var(axis=0) + 1e-5)
 
 

@@ -35,7 +35,7 @@ def updated(known: Normaliser, observations: Array) -> Normaliser:
 
 def deviation(known: Normaliser) -> Array:
     """Return the standard deviations, ``(n,)``."""
-    # added to the variance, so that a constant observation does not divide by 0
+    # the addition to the variance keeps a constant observation from a division by 0
     return jnp.sqrt(known.variance + 1e-5)
 
 

@@ -242,8 +242,8 @@ def levels(rows: pd.DataFrame) -> np.ndarray:
     low, high = rmse_interval(with_variance_interval(rows))
     reach = 2.0 * rows["reference_se"] / rows["reference_norm"]
     low, high = low / (1.0 + reach), (high / (1.0 - reach)).where(reach < 1.0, np.inf)
-    # relative program error up to which a gradient counts as the derivative of its program. Differences of float32
-    # costs have two digits
+    # a gradient counts as the derivative of its program up to a program error of 2%: differences of float32 costs have
+    # two digits
     is_right = (rows["status"] == "ok") & ~(rows["nan_share"] > 0) & (rows["program_error_rel"] <= 0.02)
     kinds = {
         "none": rows["gradient"].map(len) == 0,

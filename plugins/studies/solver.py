@@ -73,7 +73,7 @@ class Solver(StudyPackage):
         w = first_batch(cell, problem.program.n_noise)
         # both batches have the same shape, so that each program is compiled once
         gradient, target = (one.grad(problem.program.theta0, np.zeros_like(w))[:, 0] for one in (problem, limit))
-        # share of the gradient's norm up to which a coordinate of the converged gradient has no sign
+        # a coordinate of the converged gradient below this share of its norm has no sign
         has_sign = np.abs(target) > 1e-6 * norm(target)
         return {
             **finite_status("a gradient is not finite", gradient, target),

@@ -316,7 +316,7 @@ def compare(gradient: np.ndarray, truth: np.ndarray, inaccurate: float) -> dict[
     length, size, distance = norm(truth), norm(gradient), norm(gradient - truth)
     error = distance / length if length else math.inf if distance else 0.0
     cosine = float(gradient / size @ (truth / length)) if length and size else math.nan
-    # share of the truth's norm up to which one of its components counts as 0
+    # a component of the truth below this share of its norm counts as 0
     is_zero = ((gradient == 0) & (np.abs(truth) > 1e-9 * length)).any()
     verdict = "zero" if is_zero else "wrong_sign" if cosine < 0 else "ok" if error <= inaccurate else "inaccurate"
     return {"verdict": verdict, "relative_error": error, "cosine": cosine}

@@ -202,7 +202,7 @@ def _against_physics(program: Program, cost: float, gradient: np.ndarray) -> dic
 
 def _signs(gradient: np.ndarray) -> np.ndarray:
     """Return the signs of a gradient's coordinates, 0 where a coordinate is rounding error."""
-    # share of a gradient's norm up to which a coordinate counts as rounding error and its sign as 0
+    # a coordinate below this share of the norm counts as rounding error, and its sign as 0
     return np.where(np.abs(gradient) > 1e-9 * norm(gradient), np.sign(gradient), 0.0)
 
 
@@ -225,9 +225,9 @@ def traps(shown: Shown) -> pd.DataFrame:
         steps = rows.drop_duplicates("dt")
         forward, model, cosine, program = (steps[name] for name in (*names, "program_error_rel"))
         converges = forward.is_monotonic_increasing and forward.iloc[0] <= CONVERGED * forward.iloc[-1]
-        # smallest model error of a wrong gradient
+        # a gradient is wrong from a model error of 10% on
         stays_wrong = model.iloc[0] > max(CONVERGED * model.iloc[-1], 0.1)
-        # program error up to which a gradient counts as exact
+        # a gradient counts as exact up to a program error of 1e-6
         is_trap = ((cosine < 0).all() or stays_wrong) and program.max(skipna=False) <= 1e-6 and converges
         if is_trap and len(steps) > 1:
             lines += [[problem, shown.column(name).heading, *steps[name].iloc[[-1, 0]]] for name in names]

@@ -153,7 +153,7 @@ def _along(shown: Arranged, axis: Axis) -> Chart | None:
     series = compares.get(f"{compared}s", ())
     rows = attempted(pd.concat([problem.rows for problem in problems]))
     labels = (rows[_is_named(rows[compared], series)] if compared else rows)["series"].unique()
-    # most estimators of a chart along an axis, where the experiment does not name them
+    # where the experiment names no estimators, a chart along an axis has the first six
     names = compares.get("estimators") or [*labels[:6]]
     shares = [f"{len(names)} of {len(labels)} estimators"] * (len(names) < len(labels))
     lines = [_lines(problem, compared, series).set_index("label", drop=False) for problem in drawn]
@@ -376,7 +376,7 @@ def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Cha
 
 def _estimators(methods: pd.DataFrame) -> Chart:
     """Return the heat table of errors: estimators by their worst case, in families, against problems."""
-    # of an axis the first value is shown
+    # the first value of an axis is shown
     methods = methods.drop_duplicates(["estimator", "problem"])
     worst = methods["error"].where(methods["status"] == "ok", math.inf).groupby(methods["estimator"]).transform("max")
     frame = methods.loc[worst.sort_values(kind="stable").index]
@@ -422,7 +422,7 @@ def _family(estimator: str) -> str:
     entry = registry.entries()["estimators"].get(estimator)
     plugin: Any = entry and entry.plugin
     needs = getattr(plugin, "needs", None)
-    # of an estimator whose parameters decide what it needs there is no set
+    # an estimator whose parameters decide what it needs has a property here, not a set
     if not isinstance(needs, frozenset) or "grad" not in needs:
         return "costs only"
     if needs == {"grad"}:

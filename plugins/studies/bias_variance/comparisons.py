@@ -161,8 +161,8 @@ def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:
     found = pd.concat(parts).drop_duplicates(["setting", "method"], ignore_index=True)
     found = _scaled(found, found.pop("scale"))
     share = found.pop("share").where(~found["has_law"] & ~found["has_fixed_work"]).clip(upper=1.0)
-    # power of the rollouts by which an error may fall at most without a law: N^-1.5 for a Sobol set and a smooth
-    # cost. A fitted model may become exact
+    # without a law an error may fall with the rollouts as N^-2 at most: for a Sobol set and a smooth cost it falls as N^-1.5.
+    # A fitted model may become exact
     found["error_low"] *= (share**2.0).fillna(1.0).mask(found["is_fitted"] & (share < 1.0), 0.0)
     return found
 
@@ -190,7 +190,7 @@ def _at_common_rollouts(level: pd.DataFrame, of: pd.DataFrame, prefers_most: boo
     def n_known(cost: float) -> int:
         return int(of["method"][is_measured(cost) | has_law].nunique())
 
-    cost = max(sorted(costs), key=lambda cost: (n_known(cost), cost if prefers_most else -cost))
+    cost = max(costs, key=lambda cost: (n_known(cost), cost if prefers_most else -cost))
     nearest = distance(cost).fillna(math.inf).groupby(of["method"], sort=False).idxmin()
     scale = (spent / cost).where(has_law).mask(is_measured(cost), 1.0)
     return of.loc[nearest].assign(rollouts=cost, scale=scale, share=spent / cost)

@@ -58,7 +58,7 @@ def tables(shown: Arranged) -> list[Table]:
     errors = errors.assign(
         problem=_named(shown, ("scene", "contact", "integrator"), errors), method=estimator_labels(errors)
     )[[*order, *SHOWN]].sort_values(order, ignore_index=True)
-    columns = [*(COLUMNS.by_name[name] for name in (*numbers, *SHOWN[:3], "reference_norm"))]
+    columns = [COLUMNS.by_name[name] for name in (*numbers, *SHOWN[:3], "reference_norm")]
     return [
         Table("descent", found, [text("problem"), *PATH], "the descents along which gradients are taken", notes),
         Table(

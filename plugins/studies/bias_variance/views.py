@@ -178,7 +178,7 @@ def _pivot(axis: Axis | None, problem: ProblemRows, best: Container[tuple[str, s
     spent = pd.DataFrame({"rollouts": rows[ROLLOUTS] / per, "time": rows["time_s"] / per}).groupby(
         rows["method"], sort=False
     )
-    # of few samples a call takes most of the time
+    # if samples are few, most of the time is that of the call
     wide = pd.concat([wide, spent.last() if is_swept else spent.median()], axis=1).copy().rename_axis("method")
     columns = [
         interval(

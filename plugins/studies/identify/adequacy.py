@@ -88,7 +88,7 @@ def judge(
     least = tail.min(axis=0)
     probability = float(((least[1:] <= least[0]).sum() + 1.0) / (SIMULATIONS + 1.0))
     edge = np.quantile(least[1:], LEVEL)
-    # in units of the edge of each test, the largest first
+    # strengths are in units of the edge of each test
     strengths = every[:, 0] / np.quantile(every[:, 1:], 1.0 - edge, axis=1)
     order = [k for k in np.argsort(-strengths) if tail[k, 0] <= edge and probability <= LEVEL]
     contradictions = {list(statistics)[k]: float(strengths[k]) for k in order}

@@ -237,7 +237,7 @@ def _fit_statistics(fit: Fit, known: Information, is_own: bool) -> dict[str, Any
     square = (fit.residual[:measured] ** 2).sum(axis=0)
     # gaps of multiple shooting tie its initial states to the parameters
     free = max(measured - (fit.fitting.dim if shooting == "windows" else p), 1)
-    # of the fits to a right model, 0.1% have larger residuals
+    # only 0.1% of the fits to a right model have larger residuals
     has_converged = np.isfinite(square) & (square <= chdtri(free, 1e-3))
     hidden = sum(
         Information(known.names, fit.slopes(i)).rank > known.rank for i in np.flatnonzero(fit.is_finite).tolist()

@@ -89,7 +89,7 @@ class Model:
 
     def scaled(self, theta: np.ndarray) -> Model:
         """Return the model with the sizes in ``theta (p,)`` as scales, where they change the motion noticeably."""
-        # least size of an unknown without a logarithm, in units of its scale, that becomes its scale
+        # the size of an unknown without a logarithm becomes its scale if it is at least a hundredth of the scale
         is_large = np.abs(theta) > 0.01 * np.abs(self.scale)
         return dataclasses.replace(self, scale=np.where(self.scale * is_large, theta, self.scale))
 

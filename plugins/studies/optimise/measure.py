@@ -154,7 +154,7 @@ def known_optimum(cell: Cell, problem: Problem, session: Session) -> tuple[float
         known = cell.scene.optimum(cell.contact, cell.integrator)
         if known is not None:
             return known
-    # largest dimension of theta for which Newton's method computes the optimum
+    # Newton's method computes the optimum in up to 1000 dimensions
     if problem.dim > 1000 or not problem.program.continuous or "grad" not in cell.backend.provides:
         return np.nan, "unknown"
     found = stored_in(session, f"optimum_{cell.program_key}", lambda: _newton(problem))

@@ -85,7 +85,7 @@ class RunSet:
         """The seeds that choose the tunings and do not score: the first third. Empty without tunings or with few seeds."""
         seeds = sorted(int(seed) for seed in self.rows["seed"].unique())
         several = (self.rows.groupby(["problem", "method"])["tuning"].nunique() > 1).any()
-        # fewest seeds to split: some choose the tunings, the others score
+        # four seeds or more are split: some choose the tunings, the others score
         return tuple(seeds[: math.ceil(len(seeds) / 3)]) if several and len(seeds) >= 4 else ()
 
     @cached_property

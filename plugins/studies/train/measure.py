@@ -143,7 +143,7 @@ def slope_errors(exact: Training, state: Any) -> list[float]:
         slopes = np.array(
             [(exact.loss(state, h * direction) - exact.loss(state, -h * direction)) / (2 * h) for h in LENGTHS]
         )
-        # largest relative distance of the three differences from each other for a slope that is known
+        # a slope is known if the three differences agree to 1%
         is_known = np.ptp(slopes) < 0.01 * abs(slopes[1])
         ratios.append(float(gradient @ direction / slopes[1]) if is_known else math.nan)
     common = abs(np.nanmedian(ratios)) if np.isfinite(ratios).any() else math.nan

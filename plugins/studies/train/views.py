@@ -224,28 +224,36 @@ def ranked(lines: pd.DataFrame, by: Sequence[str], trainer: str = "family") -> p
     ``no result``: no run ended with a finite return.
     """
     verdicts = pd.Series("no result", lines.index, dtype=object)
-    behind: dict[Any, dict[str, Any]] = {}
-    is_run, has_ended = lines["seeds"] > 0, np.isfinite(lines["final"]) & (lines["failed"] < lines["seeds"])
-    compared = lines[has_ended | ~is_run].sort_values("tuned", ascending=False, kind="stable", na_position="last")
+    behind: dict[Any, Any] = {}
+    has_ended = np.isfinite(lines["final"]) & (lines["failed"] < lines["seeds"])
+    compared = lines[has_ended | ~(lines["seeds"] > 0)].sort_values(
+        "tuned", ascending=False, kind="stable", na_position="last"
+    )
     for _, part in compared.groupby(list(by), sort=False):
-        verdicts[part.index] = "not chosen"
-        settings, chosen = dict(iter(part.groupby(trainer)["returns"])), part.drop_duplicates(trainer)
-        verdicts[chosen.index[~is_run[chosen.index]]] = "not run"
-        chosen = chosen[is_run[chosen.index]]
-        if chosen.empty:
-            continue
-        best = chosen.loc[chosen["final"].idxmax()]
-        own = settings[best[trainer]]
-        for index, line in chosen.iterrows():
-            fewest = own.iloc[max(len(own) - len(settings[line[trainer]]), 0)]
-            behind[index], leads = distance_below(line["returns"], best["returns"])
-            leads_by_fewer = isinstance(fewest, np.ndarray) and distance_below(line["returns"], fewest)[1]
-            verdicts[index] = "tied" if not leads else "behind" if leads_by_fewer else "open"
-        del behind[best.name]
-        verdicts[best.name] = "first"
-        if len(chosen) > 1 and not (verdicts[chosen.index] == "behind").any():
-            verdicts[chosen.index] = "open"
+        found, distances = _ranked_group(part, trainer)
+        verdicts[found.index], behind = found, behind | distances
     return pd.DataFrame({"verdict": verdicts}).join(pd.DataFrame(behind, index=ends("behind", "123")).T.astype(float))
+
+
+def _ranked_group(part: pd.DataFrame, trainer: str) -> tuple[pd.Series, dict[Any, Any]]:
+    """Return the verdicts on the lines of one group, the best ``tuned`` first, and the distances behind the first of the group."""
+    verdicts, chosen = pd.Series("not chosen", part.index, dtype=object), part.drop_duplicates(trainer)
+    is_run = chosen["seeds"] > 0
+    verdicts[chosen.index[~is_run]], chosen = "not run", chosen[is_run]
+    if chosen.empty:
+        return verdicts, {}
+    best, settings = chosen.loc[chosen["final"].idxmax()], dict(iter(part.groupby(trainer)["returns"]))
+    own, behind = settings[best[trainer]], {}
+    for index, line in chosen.drop(best.name).iterrows():
+        behind[index], leads = distance_below(line["returns"], best["returns"])
+        # the best of the worst settings of the first, as many as this trainer has; NaN if its seeds are not reported
+        fewest = own.iloc[max(len(own) - len(settings[line[trainer]]), 0)]
+        leads_by_fewer = isinstance(fewest, np.ndarray) and distance_below(line["returns"], fewest)[1]
+        verdicts[index] = "tied" if not leads else "behind" if leads_by_fewer else "open"
+    verdicts[best.name] = "first"
+    if behind and not (verdicts[chosen.index] == "behind").any():
+        verdicts[chosen.index] = "open"
+    return verdicts, behind
 
 
 def distance_below(returns: np.ndarray, others: np.ndarray) -> tuple[dict[str, Any], bool]:
