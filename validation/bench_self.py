@@ -5,10 +5,10 @@ Times are processor times of calls on one thread: other load changes their ratio
 measured, and the other lines of the file stay.
 """
 
+import compileall
 import itertools
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -192,10 +192,9 @@ def command(*words):
 
 def python(*words):
     """Return the processor seconds of a Python process and all that it starts, and what it prints."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    before = sum(os.times()[2:4])
     text = subprocess.run([sys.executable, *words], check=True, capture_output=True, text=True).stdout
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, text
+    return sum(os.times()[2:4]) - before, text
 
 
 PARTS = {
@@ -211,13 +210,15 @@ def main(words):
     """Measure, print and write the speeds."""
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # one thread in all libraries, which are imported later
     folder, parts = Path(*words[:1] or ["results/bench_self"]), words[1:]
+    for part in ("bench", "plugins"):  # as after a user's first command, also where PYTHONDONTWRITEBYTECODE is set
+        compileall.compile_dir(Path(__file__).parents[1] / part, quiet=2)
     path = folder / "bench_self.csv"
-    lines = pd.read_csv(path, index_col="what").to_dict("index") if parts else {}
+    lines = pd.read_csv(path, index_col="what") if parts else pd.DataFrame(columns=["value", "unit"])
     for what, value, unit in itertools.chain.from_iterable(PARTS[part]() for part in parts or PARTS):
         print(f"{what}: {value:.3g} {unit}", flush=True)
-        lines[what] = {"value": float(value), "unit": unit, "load": os.getloadavg()[0]}
+        lines.loc[what] = value, unit
     folder.mkdir(parents=True, exist_ok=True)
-    pd.DataFrame.from_dict(lines, "index").rename_axis("what").to_csv(path, float_format="%.6g")
+    lines.to_csv(path, index_label="what")
     (folder / "machine.json").write_text(json.dumps(machine(), indent=1) + "\n")
 
 
