@@ -9,10 +9,17 @@ import bench
 from bench.errors import UserError
 from bench.experiment import config
 from bench.experiment.grid import cells
+from bench.measure import performance
 from bench.run.tasks import blank_row
 
 BASE = ["study=train", "scenes=[cartpole_swing]", "integrators=[semi_implicit_euler]", "backends=[jax]", "samples=1"]
 FINAL = {"shac": -530.0, "shac[window=8]": -700.0, "ppo": -900.0}
+
+
+@pytest.fixture(autouse=True)
+def few_resamples(monkeypatch):
+    """Fewer resamples per interval; the made-up returns are further apart than these intervals are uncertain."""
+    monkeypatch.setattr(performance, "RESAMPLES", 200)
 
 
 def made_up(final=FINAL, seeds=range(5), spread=10.0, **columns):
