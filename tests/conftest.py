@@ -16,11 +16,15 @@ from bench.model import registry
 
 QUICK = (
     "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true "
-    "--xla_cpu_parallel_codegen_split_count=1"
+    "--xla_cpu_parallel_codegen_split_count=1 --xla_cpu_multi_thread_eigen=false"
 )
 """Tests compile hundreds of programs and run each for milliseconds. Without optimisation and fused loops, XLA compiles in a
 quarter of the time, and numbers are equal up to rounding. One module per program instead of up to 32, whose threads would
 share the cores with other tests, takes 40% off that. Processes that a test starts inherit the setting."""
+
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+"""Threads that wait for small products of matrices in other threads take a tenth of the processor time of tests. The processes
+of pytest-xdist, and those that a test starts, inherit these variables."""
 
 COMPILED = ("bench", "plugins", "validation")
 """Folders whose bytecode is written before the tests, also where PYTHONDONTWRITEBYTECODE is set: hundreds of processes import
@@ -32,6 +36,7 @@ def pytest_configure(config):
         for folder in COMPILED:
             compileall.compile_dir(config.rootpath / folder, quiet=2)
     os.environ["XDG_CACHE_HOME"] = str(config.rootpath / ".pytest_cache" / "home")
+    os.environ |= {name: os.environ.get(name, count) for name, count in ONE_THREAD.items()}
     os.environ["XLA_FLAGS"] = f"{QUICK} {os.environ.get('XLA_FLAGS', '')}".strip()
 
 
@@ -40,7 +45,7 @@ def pytest_collection():
     """Write the bytecode of test files for later sessions, and exempt what collection imports from garbage collection.
 
     The bytecode of files that tests edit is never written. A full garbage collection traverses all objects of JAX, torch and
-    the tests, and took a tenth of the time of tests.
+    the tests, and took a tenth of the time of tests. Tests leave little garbage, so that collections are rare.
     """
     chosen, sys.dont_write_bytecode = sys.dont_write_bytecode, False
     gc.disable()
@@ -50,6 +55,7 @@ def pytest_collection():
         sys.dont_write_bytecode = chosen
         gc.enable()
         gc.freeze()
+        gc.set_threshold(20_000, 20, 50)
 
 
 DRAWN = {

@@ -24,9 +24,12 @@ from bench.model import registry
 MACHINE = {"processor": "a chip", "cores": 2, "system": "Linux", "load_average": [0.1, 0.1, 0.1]}
 
 
+GIVEN = small_rows(backends=("jax",), estimators=("fobg", "reinforce"))
+
+
 def given():
     """Made-up rows of two estimators."""
-    return small_rows(backends=("jax",), estimators=("fobg", "reinforce"))
+    return GIVEN.copy()
 
 
 def compared(before, after, columns: Columns = COLUMNS, again=()):

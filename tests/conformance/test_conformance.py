@@ -715,11 +715,6 @@ def test_every_check_of_every_variant_is_an_item():
     assert set(found(Penalty, "smoothing_converges")) == {("skip", "has no smoothing")}
 
 
-@parametrize([ClaimsAJump], expected_failures={"continuity_is_as_declared": "planted"})
-def test_expected_failures_are_xfailed(plugin, check):
-    check(plugin)
-
-
 def test_expected_failures_are_strict_and_say_why():
     made = items([Cubic, Quadratic], expected_failures={"cubic-backends_agree": "see #12", "has_docstring": "late"})
     marks = {title: [(m.name, m.kwargs) for m in item.marks] for title, item in made.items() if item.marks}

@@ -202,7 +202,7 @@ time.sleep(100)
 @pytest.mark.parametrize(
     ("fault", "limit", "status", "reason"),
     [
-        ("loop", "timeout=4s", "timeout", "no result within 4 s"),
+        ("loop", "timeout=10s", "timeout", "no result within 10 s"),
         ("memory", "memory=1G", "crashed", "more than 1 GiB of memory"),
     ],
 )

@@ -156,14 +156,14 @@ def test_columns_of_a_batch_have_parameters_of_their_own_in_equations(case, back
     *parts, names = SOLVING[case]
     problem = backend.compile(compose(*parts, Decision(names)))
     theta = problem.program.theta0
-    factors = np.array([np.linspace(0.5, 2.0, 4), np.linspace(1.5, 0.7, 4), np.linspace(0.8, 1.6, 4)])
+    factors = np.array([[0.5, 2.0], [1.5, 0.7], [0.8, 1.6]])
     spread = theta[:, None] * factors[: theta.size]
     costs, gradients = (function(spread, np.zeros(spread.shape)) for function in (problem.value, problem.grad))
     for i, values in enumerate(spread.T):
         single = compose(*rebuilt(parts, names, values))
         own = backend.compile(single).value(single.theta0, np.zeros((single.n_noise, 1)))[0]
         assert costs[i] == pytest.approx(own, rel=SOLVED)
-    assert len(set(costs)) == 4
+    assert costs[0] != costs[1]
     alone = problem.grad(spread[:, 1], np.zeros((theta.size, 1)))[:, 0]
     assert gradients[:, 1] == pytest.approx(alone, rel=AGREES)
 

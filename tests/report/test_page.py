@@ -10,7 +10,7 @@ import helpers
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import experiment, row, small_rows, stiffness_rows, table
+from helpers import STIFFNESS, experiment, row, small_rows, stiffness_rows, table
 
 from bench.experiment.columns import Column
 from bench.experiment.views import Chart
@@ -40,7 +40,7 @@ def page(rows, study=None, **given):
 def text():
     """The page of a few rows, with a chart and the same under another name."""
     made, rows = experiment(), small_rows()
-    along = views_of(made, stiffness_rows(sigmas=(0.1,))).charts[0]
+    along = views_of(made, small_rows(stiffness=STIFFNESS[:3])).charts[0]
     shown = replace(views_of(made, rows), charts=[along, replace(along, name="other")])
     return helpers.page(made, rows, shown)
 
@@ -63,9 +63,10 @@ def finding(text):
 
 
 def test_the_page_shows_what_to_use_where():
-    rows = stiffness_rows(backends=("jax",))
+    rows = small_rows(backends=("jax",))
     table_of_uses = next(one for one in views_of(experiment(), rows).tables if one.page)
-    assert all(html.escape(where) in page(rows) for where in table_of_uses.frame["where"])
+    shown = page(rows)
+    assert all(html.escape(where) in shown for where in table_of_uses.frame["where"])
 
 
 def test_the_page_says_when_nothing_ran():
@@ -167,12 +168,9 @@ def test_filters_take_cells_stay_in_the_address_and_the_csv_has_what_is_shown(sh
     assert shown.do("shown.length") == len(left.query("backend == 'numpy'"))
     shown.page.get_by_role("button", name="Show all").click()
     assert shown.do("location.hash") == ""
-    shown.do(
-        f"location.hash = {json.dumps('#' + link.partition('#')[2])}; new Promise((done) => setTimeout(done, 200))"
-    )
-    assert f"{len(left)} of {len(rows)} cells" in shown.do("document.getElementById('shown').textContent")
-    shown.do("location.hash = '#nonsense=%E0%A4%A'; new Promise((done) => setTimeout(done, 200))")
-    assert f"{len(rows)} of {len(rows)} cells" in shown.do("document.getElementById('shown').textContent")
+    for anchor, count in ((link.partition("#")[2], len(left)), ("nonsense=%E0%A4%A", len(rows))):
+        shown.do(f"location.hash = {json.dumps('#' + anchor)}")
+        shown.wait(f"document.getElementById('shown').textContent.includes('{count} of {len(rows)} cells')")
 
 
 def test_table_sorts_both_ways_and_has_missing_values_last(shown):

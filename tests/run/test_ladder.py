@@ -44,7 +44,7 @@ class Forgetful(NumpyProblem):
 SCENES = ["double_integrator", "pendulum", "cartpole", "mass_spring"]
 WORDS = [
     "name=climb",
-    "study=gradient_check",
+    "study=gradient_check[directions=1,drawn=2,around=1]",
     f"scenes=[{','.join(SCENES)}]",
     "estimators=[fobg]",
     "sweep.horizon=[3]",

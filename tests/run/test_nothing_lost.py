@@ -191,9 +191,9 @@ def test_large_items_behind_a_hanging_one_do_not_hold_up_the_clock():
     big = "x" * 600_000
     started = time.monotonic()
     results, found = answers(
-        [("sound", big), ("hangs", big), *((f"more{i}", big) for i in range(6))], Execution(timeout=1.0)
+        [("sound", big), ("hangs", big), *((f"more{i}", big) for i in range(6))], Execution(timeout=10.0)
     )
-    assert time.monotonic() - started < 30
+    assert time.monotonic() - started < 300  # a hanging cell sleeps for 1,000 s
     assert results["hangs"]["status"] == "timeout"
     assert len(found) == 8
 
@@ -347,7 +347,7 @@ def test_signals_stop_a_run_in_peace(tmp_path, sent, times):
             run.send_signal(getattr(signal, sent))
             time.sleep(0.005)
         try:
-            said = run.communicate(timeout=30)[1]
+            said = run.communicate(timeout=300)[1]
         finally:
             run.kill()
     assert run.returncode in ((130,) if times == 1 else (130, -getattr(signal, sent)))

@@ -5,7 +5,15 @@ import pytest
 
 from bench.cli import main
 
-WORDS = ["scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg]", "repeats=4", "timing=false", "workers=0"]
+WORDS = [
+    "scenes=[quadratic]",
+    "backends=[numpy]",
+    "estimators=[fobg]",
+    "repeats=4",
+    "timing=false",
+    "workers=0",
+    "formats=[]",
+]
 
 
 @pytest.fixture(scope="module")

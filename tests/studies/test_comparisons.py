@@ -45,6 +45,11 @@ def cell(error, low, high, **values):
     }
 
 
+def near(error, share=0.1, **values):
+    """A row whose relative RMSE is known to a share of itself."""
+    return cell(error, (1 - share) * error, (1 + share) * error, **values)
+
+
 def made(*cells, **given):
     """Methods and comparisons of cells along the stiffness."""
     rows = with_gradient_cost(table(list(cells)))
@@ -104,7 +109,7 @@ def test_the_lowest_interval_is_apart_from_those_of_other_estimators(high, found
 def test_methods_are_tied_unless_the_interval_of_their_factor_is_above_1():
     _, compared = made(
         *(
-            cell(e, 0.9 * e, 1.1 * e, stiffness=k, estimator=n, gradients=0)
+            near(e, stiffness=k, estimator=n, gradients=0)
             for k in (1e2, 1e4)
             for n, e in (("fobg", 0.10), ("reinforce", 0.105), ("finite_difference", 0.4))
         )
@@ -137,10 +142,9 @@ def test_a_failed_cell_fails_its_estimator_and_a_refused_one_does_not():
 def by_samples(estimator, rollouts, gradients=0.0, scale=1.0):
     """Cells whose error is ``scale`` over the root of N, with some rollouts and gradients per sample."""
     return [
-        cell(
-            e := scale / math.sqrt(n),
-            0.99 * e,
-            1.01 * e,
+        near(
+            scale / math.sqrt(n),
+            0.01,
             estimator=estimator,
             samples=n,
             rollouts=rollouts * n + 0.01,
@@ -172,14 +176,14 @@ RESCALED = {0.0: math.sqrt(2.0), 0.2: math.hypot(0.2, 0.3 * math.sqrt(2.0)) / ma
 def test_at_one_number_of_samples_variances_are_rescaled_and_biases_stay(bias):
     """Both have the same error at 100 samples, which are 100 and 200 rollouts."""
     given = {"bias": 4 * bias, "bias_low": 3.9 * bias, "bias_high": 4.1 * bias}
-    _, compared = made(
-        *(
-            cell(0.3, 0.29, 0.31, stiffness=1e2, estimator=name, rollouts=n, gradients=0) | given
-            for name, n in (("fobg", 100), ("randomized_smoothing", 200))
-        )
-    )
+    _, compared = made(*(of(name, n, **given) for name, n in (("fobg", 100), ("randomized_smoothing", 200))))
     assert compared[["first", "rollouts"]].values.tolist() == [["fobg", 100]]
     assert compared["factor"].item() == pytest.approx(RESCALED[bias])
+
+
+def of(name, rollouts, error=0.3, **values):
+    """A row of an estimator at one stiffness that takes so many rollouts."""
+    return near(error, 0.05, stiffness=1e2, rollouts=rollouts, gradients=0, estimator=name) | values
 
 
 @pytest.mark.parametrize(
@@ -193,10 +197,6 @@ def test_at_one_number_of_samples_variances_are_rescaled_and_biases_stay(bias):
 def test_where_no_law_gives_the_error_at_equal_rollouts_that_at_fewer_stands(estimator, given):
     """Fewer rollouts than all may take are allowed, and the most that a method takes are the rollouts of the comparison."""
 
-    def of(name, rollouts, error=0.3, **values):
-        ends = (0.95 * error, 1.05 * error)
-        return cell(error, *ends, stiffness=1e2, rollouts=rollouts, gradients=0, estimator=name) | values
-
     _, compared = made(of(estimator, 200, **given), of("fobg", 100, 0.1))
     assert compared[["first", "rollouts"]].values.tolist() == [["fobg", 200]]
     _, compared = made(of(estimator, 200, **given), of("reinforce", 100, 0.1, draws="orthogonal"))
@@ -205,12 +205,6 @@ def test_where_no_law_gives_the_error_at_equal_rollouts_that_at_fewer_stands(est
 
 def test_a_method_is_not_beaten_by_one_that_is_scaled_above_its_own_rollouts():
     """With as many rollouts its error might be lower, so it ties; with a lower error at fewer rollouts it is first."""
-
-    def of(name, rollouts, error, **values):
-        return (
-            cell(error, 0.95 * error, 1.05 * error, stiffness=1e2, rollouts=rollouts, gradients=0, estimator=name)
-            | values
-        )
 
     _, compared = made(of("reinforce", 100, 0.3, draws="sobol"), of("fobg", 100, 0.3), of("guided", 400, 0.9))
     assert compared[["first", "rollouts", "tied"]].values.tolist() == [["fobg", 400, ("reinforce",)]]
@@ -231,10 +225,7 @@ def test_costs_that_do_not_grow_with_samples_are_compared_where_the_rollouts_suf
 
 def test_a_method_of_one_rollout_does_not_decide_the_rollouts_of_a_comparison():
     """One call without noise may use no more, so others are compared with it at the rollouts that they take."""
-    cells = [
-        cell(error, 0.95 * error, 1.05 * error, stiffness=1e2, estimator=name, rollouts=n, gradients=0)
-        for name, n, error in (("fobg", 100, 0.1), ("randomized_smoothing", 200, 0.2), ("plain", 1, 0.3))
-    ]
+    cells = of("fobg", 100, 0.1), of("randomized_smoothing", 200, 0.2), of("plain", 1)
     assert made(*cells)[1][["first", "rollouts"]].values.tolist() == [["fobg", 100]]
 
 
@@ -262,7 +253,7 @@ def test_an_upper_limit_is_shown_and_never_first_nor_bold():
     """It was 0, dropped by log axes, or first by the luck of the reference's error."""
     cells = [
         *(vague(0.001, 0.1, stiffness=k, estimator="fobg") for k in (1e2, 1e4)),
-        *(cell(e, 0.9 * e, 1.1 * e, stiffness=k, estimator="reinforce") for k, e in ((1e2, 0.1), (1e4, 0.3))),
+        *(near(e, stiffness=k, estimator="reinforce") for k, e in ((1e2, 0.1), (1e4, 0.3))),
     ]
     methods, compared = made(*cells)
     assert list(compared["first"]) == ["reinforce", ""], "the limit is below the other's interval at 1e4"
@@ -313,7 +304,7 @@ def test_what_does_not_work_is_never_recommended():
     """The lowest error was recommended also at 1.13 times the gradient, where every interval lies above 1."""
     errors = {"fobg": (0.1, 1.3, 1.02, 0.95), "reinforce": (0.5, 3.0, 1.4, 0.5)}
     cells = [
-        cell(e, 0.9 * e, 1.1 * e, stiffness=k, estimator=name, gradients=0)
+        near(e, stiffness=k, estimator=name, gradients=0)
         for name, some in errors.items()
         for k, e in zip((1e1, 1e2, 1e3, 1e4), some, strict=True)
     ]
@@ -324,7 +315,7 @@ def test_what_does_not_work_is_never_recommended():
 
 def test_of_backends_that_differ_only_those_are_recommended_whose_error_is_small():
     errors = {"jax": 0.1, "mujoco": 1.5}
-    found = recommended(*(cell(e, 0.9 * e, 1.1 * e, backend=b, estimator="fobg") for b, e in errors.items()))
+    found = recommended(*(near(e, backend=b, estimator="fobg") for b, e in errors.items()))
     assert found["use"].tolist() == ["fobg (jax)"]
 
 
@@ -352,11 +343,7 @@ def test_an_estimate_that_is_always_0_fails():
 
 def along(errors, **given):
     """Cells along three stiffnesses with an error per backend."""
-    return [
-        cell(e, 0.9 * e, 1.1 * e, stiffness=k, backend=b, time_s=t, **given)
-        for k in (1e2, 1e3, 1e4)
-        for b, (e, t) in errors.items()
-    ]
+    return [near(e, stiffness=k, backend=b, time_s=t, **given) for k in (1e2, 1e3, 1e4) for b, (e, t) in errors.items()]
 
 
 def test_a_chart_shows_the_backends_that_its_experiment_compares():
@@ -376,10 +363,8 @@ def test_time_to_an_error_is_drawn_per_backend_that_is_compared_and_with_what_ne
     samples, sigmas = [16, 64, 256, 1024], [0.1, 0.3]
     never = {"bias": 2.0, "bias_low": 1.9, "bias_high": 2.1}
     cells = [
-        cell(
-            e := share * n**-0.5,
-            0.9 * e,
-            1.1 * e,
+        near(
+            share * n**-0.5,
             samples=n,
             sigma=s,
             backend=b,

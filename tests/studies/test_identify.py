@@ -293,7 +293,7 @@ def test_fits_take_gauss_newton_unless_another_optimizer_is_named():
 )
 def test_wrong_models_are_noticed_and_the_right_one_is_not_blamed(name, least, most):
     clean, noise = next((record, noise) for label, record, noise in wrong_models.cases("spring") if label == name)
-    noticed, inside, printed, _ = wrong_models.run("spring", clean, noise, 32)
+    noticed, inside, printed, _ = wrong_models.run("spring", clean, noise, 24)
     assert least <= noticed <= most
     if "AR" in name:
         assert inside < 0.6 < 0.8 < printed

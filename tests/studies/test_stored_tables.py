@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 from helpers import stored
 from numpy.linalg import norm
 from trees import ROOT
 
-from bench.experiment import config
 from bench.experiment.columns import COMMON
 from bench.report.draw import BOLD, WIDTH
 from bench.report.finish import views_of
@@ -34,11 +34,9 @@ FAST = {
     "twins",
 }
 """An experiment of each study."""
-NAMES = {
-    path.relative_to(folder).with_suffix("").as_posix(): words
-    for folder, words in ((ROOT / "conf/experiment", []), (EXAMPLE / "experiment", [f"plugins={EXAMPLE}"]))
-    for path in sorted(folder.rglob("*.yaml"))
-}
+FOLDERS = {ROOT / "conf/experiment": [], EXAMPLE / "experiment": [f"plugins={EXAMPLE}"]}
+FILES = {path: folder for folder in FOLDERS for path in sorted(folder.rglob("*.yaml"))}
+NAMES = {path.relative_to(folder).with_suffix("").as_posix(): FOLDERS[folder] for path, folder in FILES.items()}
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n not in FAST)) for n in NAMES])
@@ -68,12 +66,13 @@ def test_tables_of_stored_rows_are_the_stored_tables(name):
                 assert not path.exists() or content == path.read_text(), file
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_the_title_of_an_experiment_is_one_question_in_one_line(name):
+def test_the_title_of_an_experiment_is_one_question_in_one_line():
     """A title of two lines asked two questions, and no row of its chart answered the second."""
-    title = config.load([f"experiment={name}", *NAMES[name]]).question
-    assert title.count("?") == title.endswith("?") == 1
-    assert "\n" not in filled(title, 0.97 * WIDTH / BOLD)
+    titles = [title for path in FILES if (title := yaml.safe_load(path.read_text()).get("question"))]
+    assert len(titles) > 30
+    for title in titles:
+        assert title.count("?") == title.endswith("?") == 1, title
+        assert "\n" not in filled(title, 0.97 * WIDTH / BOLD), title
 
 
 def test_the_chart_of_a_solver_shows_the_errors_of_stored_gradients_that_have_not_converged():
