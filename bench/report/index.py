@@ -21,14 +21,10 @@ from bench.report.web import shell
 from bench.run.files import write_whole
 from bench.run.rows import read_object, read_parquet
 
-YEAR_3000 = 32503680000.0
-"""Seconds since 1970 that no run has stored."""
 GOOD = ("ok", "unsupported", "unavailable", "waiting")
 """Statuses that do not count as failures: the cell has a result, or was refused with a reason."""
 OWN_FILES = ("rows.parquet", "run.json", "answer.json")
 """Files whose folder is listed."""
-LISTED = (".html", ".md", ".csv", ".tex", ".png", ".svg", ".pdf")
-"""Suffixes of the files that a card lists."""
 
 
 def write(folder: Path) -> Path:
@@ -88,7 +84,8 @@ def _card(folder: Path, place: Path) -> str:
         named = escape(f"{label} of {name}")
         parts.append(f'<a class="button" href="{_link(folder, target)}" aria-label="{named}">{label}</a>')
     notes = [when, *(f"commit {text[:12]}" for key, text in texts.items() if key == "git_commit")]
-    files = sorted(p for p in place.iterdir() if p.suffix in LISTED and ".plotted" not in p.name)
+    suffixes = (".html", ".md", ".csv", ".tex", ".png", ".svg", ".pdf")
+    files = sorted(path for path in place.iterdir() if path.suffix in suffixes and ".plotted" not in path.name)
     links = "".join(f'<li><a href="{_link(folder, path)}">{escape(path.name)}</a></li>' for path in files)
     parts.append(
         f"<details><summary>{counted(len(files), 'file')}</summary>"
@@ -123,7 +120,8 @@ def _state(path: Path, counts: Any, when: str) -> tuple[str, str]:
             table = read_parquet(path, ["status", "stored_at"])
             counts = table["status"].value_counts().to_dict()
             newest = float(pd.to_numeric(table["stored_at"], errors="coerce").max())
-            if 0 <= newest < YEAR_3000:
+            # no run has stored a row after the year 3000
+            if 0 <= newest < 32503680000.0:
                 when = time.strftime("newest row of %Y-%m-%d %H:%M UTC", time.gmtime(newest))
         except Exception as error:  # any error in the file is reported on the page
             return f'<span class="bad">rows.parquet cannot be read: {escape(str(error)[:200])}</span>', ""

@@ -16,9 +16,6 @@ from bench.report.generic import own_columns
 from bench.report.problems import varying_identity
 from bench.report.views import arrange, unsteady
 
-DIGITS = 6
-"""Significant digits of the numbers in a page."""
-FORMAT = f".{DIGITS}g"
 MOST = 24
 """Largest number of distinct values of a column that is offered as a filter."""
 IN_SIGHT, FIRST = 5, 3
@@ -112,5 +109,5 @@ def encode(values: pd.Series) -> Any:
 def _short(value: float) -> float | int | None:
     if value is None or not math.isfinite(value):
         return None
-    value = float(format(value, FORMAT))
+    value = float(f"{value:.6g}")
     return int(value) if value.is_integer() and abs(value) < 1e15 else value

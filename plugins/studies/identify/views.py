@@ -38,8 +38,6 @@ the 95% intervals miss the truth instead of 5%.
 ESTIMATED = ("parameter", "estimate", "estimate_low", "estimate_high", "bias", "unit", "identifiable", "start")
 BIASED = ("biased", "term", "unnoticed", "errors")
 """Columns with lists whose entries are lines of a table."""
-TEXTS = ("shooting", "parameter", "unit", "identifiable", "biased", "term")
-"""Those with lists of words."""
 ESTIMATES = (
     "estimate: of the first record, by one rollout. low, high: its 95% interval. seen: whether the record identifies the parameter; product: "
     "only products with it. bias: the largest that a term of the next table can cause, to first order, while 5% of "
@@ -82,7 +80,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
             for row in zip(*doubts.values(), strict=True)
         ],
     )
-    kinds: dict[str, Any] = {"list": "number"} | dict.fromkeys(TEXTS, "text")
+    words = ("shooting", "parameter", "unit", "identifiable", "biased", "term")
+    kinds: dict[str, Any] = {"list": "number"} | dict.fromkeys(words, "text")
     by_name = {c.name: replace(c, kind=kinds.get(c.name, kinds.get(c.kind, c.kind))) for c in experiment.columns.all}
     by_name |= {name: text(name) for name in ("problem", "doubt", "verdict")}
 
