@@ -66,6 +66,9 @@ LIMIT: dict[str, Any] = {"color": "#000000", "linewidth": 1.4}
 MANY = 12
 """Most points of a line that are drawn with markers; longer lines are drawn without."""
 
+Drawn = Sequence[tuple[Chart, Sequence[Figure]]]
+"""Charts, each with its figures: the wide one, and a narrow one if that differs."""
+
 
 def draw(chart: Chart, is_narrow: bool = False) -> Figure:
     """Return the chart as a figure, two columns of a paper wide, or one for plots without panels side by side.

@@ -15,7 +15,7 @@ from bench.experiment.views import Chart, Table, Views
 from bench.report import terminal
 from bench.report.cells import TableCell, parts, readable, text_rows
 from bench.report.colours import looks_by_name
-from bench.report.draw import NARROW, draw
+from bench.report.draw import NARROW, Drawn, draw
 from bench.report.figures import save, styled
 from bench.report.latex import latex
 from bench.report.tables import csv_text, escape_markdown
@@ -30,7 +30,7 @@ LEAST = 3
 """Fewest values that are drawn."""
 
 
-def write(experiment: Experiment, views: Views, drawn: Sequence[tuple[Chart, Sequence[Figure]]]) -> list[Path]:
+def write(experiment: Experiment, views: Views, drawn: Drawn) -> list[Path]:
     """Write all tables, the charts as :func:`drawings` gives them, and the answer of an experiment; return the files' paths."""
     charts = []
     with styled():
@@ -69,7 +69,7 @@ def _is_telling(chart: Chart) -> bool:
     return len(frame) >= LEAST and (not is_line or frame[x].nunique() >= LEAST)
 
 
-def answer_json(experiment: str, question: str, answer: str, drawn: Sequence[tuple[Chart, Sequence[Figure]]]) -> str:
+def answer_json(experiment: str, question: str, answer: str, drawn: Drawn) -> str:
     """Return the content of :data:`ANSWER`."""
     chart = drawn[0][0].name if drawn else ""
     content = {"experiment": experiment, "question": question, "answer": answer, "chart": chart}

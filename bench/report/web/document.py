@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from bench.experiment.views import Chart, Views
 from bench.report.cells import readable
+from bench.report.draw import Drawn
 from bench.report.web import shell
 
 
@@ -23,7 +24,7 @@ def page(
     question: str,
     views: Views,
     data: Mapping[str, Any],
-    drawn: Sequence[tuple[Chart, Sequence[Figure]]] = (),
+    drawn: Drawn = (),
     record: Mapping[str, Any] = MappingProxyType({}),
 ) -> str:
     """Return the page as HTML. ``data`` are the cells, see :func:`~bench.report.web.data.cells_data`, and ``record`` is ``run.json``."""
