@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
-from bench.model.blocks import padded
+from bench.model.blocks import OfColumns, padded
 
 N_COLUMNS = 4096
 """Columns of every batch of a reference, constant so that a compiling backend compiles once, and fewer if few samples are drawn."""
 
 
-def in_columns(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray, columns: int) -> np.ndarray:
+def in_columns(function: OfColumns, w: np.ndarray, columns: int) -> np.ndarray:
     """Return ``function(w)``, ``(..., B)``, for noise ``w (n_w, B)``, evaluated ``columns`` at a time.
 
     The last part is padded with copies of its last column, whose results are dropped.

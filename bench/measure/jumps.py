@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from bench.measure.batches import in_columns
 from bench.model import Problem
+from bench.model.blocks import OfColumns
 
 PARTS = 64
 """Default number of intervals of each line at the first level."""
@@ -189,9 +189,7 @@ def jump_under_noise(problem: Problem, theta: np.ndarray, seed: int, columns: in
     return jump, starts[:, jump.line] + jump.at * (ends[:, jump.line] - starts[:, jump.line])
 
 
-def largest_jump(
-    cost: Callable[[np.ndarray], np.ndarray], starts: np.ndarray, ends: np.ndarray, parts: int = PARTS
-) -> Jump:
+def largest_jump(cost: OfColumns, starts: np.ndarray, ends: np.ndarray, parts: int = PARTS) -> Jump:
     """Return the largest jump of ``cost`` on the lines from ``starts (n, L)`` to ``ends (n, L)``.
 
     ``cost`` maps points ``(n, B)`` to ``(B,)``. As intervals of length h shrink, the second difference of a smooth cost
@@ -230,9 +228,7 @@ def largest_jump(
     return Jump(change if is_jump else 0.0, span, int(line[best]), float(nodes[best, at : at + 2].mean()))
 
 
-def _costs_at(
-    cost: Callable[[np.ndarray], np.ndarray], starts: np.ndarray, ends: np.ndarray, nodes: np.ndarray
-) -> np.ndarray:
+def _costs_at(cost: OfColumns, starts: np.ndarray, ends: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """Return the costs ``(L, P)`` at shares ``nodes`` of the way from ``starts (n, L)`` to ``ends``; NaN where not finite."""
     line, share = np.repeat(np.arange(len(nodes)), nodes.shape[1]), nodes.ravel()
     held = max(1, MOST_POINTS // len(starts))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -12,6 +11,7 @@ import numpy as np
 
 from bench.measure.batches import N_COLUMNS, in_columns
 from bench.model import Problem
+from bench.model.blocks import OfColumns
 
 NODES = 8
 """Number of Gauss-Legendre nodes per panel."""
@@ -307,7 +307,7 @@ class _Shells:
         return float(rest[SPACING * (last.clip(0) + 1) >= LEAST_LIMIT].sum())
 
 
-def _limits(excess: Callable[[np.ndarray], np.ndarray], width: int) -> _Limits:
+def _limits(excess: OfColumns, width: int) -> _Limits:
     """Return the limits of integration for ``excess (width, B) -> (B,)``, the cost minus that at 0.
 
     Points on rays up to 38 standard deviations show where the integrand has mass, such as the mean of exp(8 w), which
@@ -336,7 +336,7 @@ def _limits(excess: Callable[[np.ndarray], np.ndarray], width: int) -> _Limits:
     return _Limits(low, high, 2.0 * (beyond + unseen), note)
 
 
-def _shells(excess: Callable[[np.ndarray], np.ndarray], width: int) -> _Shells:
+def _shells(excess: OfColumns, width: int) -> _Shells:
     """Return the mass on rays, as far out as it has vanished."""
     turn = 2.0 * math.pi * (np.arange(RAYS) + 0.5) / RAYS
     rays = np.array([[-1.0, 1.0]]) if width == 1 else np.stack([np.cos(turn), np.sin(turn)])
@@ -355,7 +355,7 @@ def _shells(excess: Callable[[np.ndarray], np.ndarray], width: int) -> _Shells:
     return _Shells(points, np.where(ended, 0.0, mass), ended)
 
 
-def _missed(excess: Callable[[np.ndarray], np.ndarray], edges: list[np.ndarray]) -> float:
+def _missed(excess: OfColumns, edges: list[np.ndarray]) -> float:
     """Return the largest change, from coarse to fine panels, of E[f(w) w] along an axis or a diagonal through w = 0.
 
     The lines show what may lie between the points of a rule, such as a narrow ridge. ``edges`` are those of each axis.
@@ -370,7 +370,7 @@ def _missed(excess: Callable[[np.ndarray], np.ndarray], edges: list[np.ndarray])
     return max(changes)
 
 
-def _bisected(integrand: Callable[[np.ndarray], np.ndarray], ends: np.ndarray) -> tuple[float, float, int, float]:
+def _bisected(integrand: OfColumns, ends: np.ndarray) -> tuple[float, float, int, float]:
     """Return the mean of ``integrand (B,) -> (B,)`` under the normal density, its last change, the points used, and a power.
 
     Panels between ``ends`` that change when they are halved are halved again, so that spikes, jumps and poles are
@@ -434,7 +434,7 @@ def _panels(edges: np.ndarray, count: int, shift: float) -> tuple[np.ndarray, np
     return nodes, (half * w).ravel() * np.exp(-(nodes**2) / 2) / math.sqrt(2 * math.pi)
 
 
-def _noise(cost: Callable[[np.ndarray], np.ndarray], width: int) -> float:
+def _noise(cost: OfColumns, width: int) -> float:
     """Return a bound on the cost's rounding noise, from fourth differences over stencils too short to show its shape.
 
     The fourth difference of independent errors of variance s^2 has the variance 70 s^2. A stencil that contains a kink

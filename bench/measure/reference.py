@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
@@ -15,6 +15,7 @@ from bench.measure.jumps import coordinates, largest_jump
 from bench.measure.quadrature import TOLERANCE, integrate
 from bench.measure.statistics import THREE, Sampling, Truth, bias_interval, heavy_tails
 from bench.model import Problem, Program
+from bench.model.blocks import OfColumns
 
 BATCHES = 64
 """Number of independent batch means that represent a sampled reference."""
@@ -267,7 +268,7 @@ def _unlisted_jumps(program: Program) -> bool:
 # ------------------------------------------------------------------------------------------------ sampling
 
 
-Terms = Callable[[np.ndarray], np.ndarray]
+Terms = OfColumns
 """Maps noise ``(n_w, B)`` to per-sample terms ``(d, B)`` whose expectation is the gradient."""
 
 

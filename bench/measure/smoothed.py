@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
 
 import numpy as np
 
 from bench.measure.batches import N_COLUMNS
 from bench.measure.reference import BATCHES, LEAST_SAMPLES, Reference, doubling_batches, draw_columns
 from bench.model import Problem, Program, compose
+from bench.model.blocks import OfColumns
 
 
 def widened(program: Program, radius: float) -> Program:
@@ -44,7 +44,7 @@ def over_ball(problem: Problem, provides: frozenset[str], radius: float, samples
         u, share = _polar(problem, w)
         return problem.grad(theta[:, None] + radius * share * u, problem.centred(w))
 
-    orders: dict[str, Callable[[np.ndarray], np.ndarray]] = {"zeroth_order": zeroth}
+    orders: dict[str, OfColumns] = {"zeroth_order": zeroth}
     if program.continuous and "grad" in provides and not program.surrogate:
         orders["first_order"] = first
     columns = min(N_COLUMNS, BATCHES * max(1, samples // (4 * BATCHES)))

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bench.model.blocks import OfColumns
 from bench.model.manifold import difference, n_changes, retract, slope_by_changes
 from bench.model.ops import LoopOps
 from bench.model.problem import Jacobians, Problem
@@ -73,7 +74,7 @@ def slopes_along(program: Rollout, path: Jacobians, theta: np.ndarray, w: np.nda
     def end(x: np.ndarray) -> np.ndarray:
         return np.asarray(scene.terminal_cost(np, *scene.split(x)))
 
-    def by_state(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
+    def by_state(function: OfColumns, x: np.ndarray) -> np.ndarray:
         if n_changes(scene) == len(x):
             return _central_differences(function, x)
         still = np.zeros((n_changes(scene), x.shape[1]))
@@ -178,7 +179,7 @@ def _difference_jacobians(program: Rollout, theta: np.ndarray, w: np.ndarray) ->
         with np.errstate(all="ignore"):
             return np.concatenate(program.step(ops, program.scene.split(x), u))
 
-    def by(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
+    def by(function: OfColumns, x: np.ndarray) -> np.ndarray:
         return np.stack([_unflatten(row, len(controls)) for row in _central_differences(function, x)], axis=1)
 
     a = by(lambda x: after(x, u), before)
@@ -186,7 +187,7 @@ def _difference_jacobians(program: Rollout, theta: np.ndarray, w: np.ndarray) ->
     return Jacobians(states, controls, a, b)
 
 
-def _central_differences(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
+def _central_differences(function: OfColumns, x: np.ndarray) -> np.ndarray:
     """Return the derivatives ``(k, n, C)`` of ``function: (n, C) -> (k, C)``, column by column."""
     rows = []
     for i in range(len(x)):

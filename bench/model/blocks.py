@@ -14,6 +14,9 @@ import numpy as np
 MIN_COLUMNS = 512
 """Minimum columns per thread for which another thread saves time; a problem may set its own minimum."""
 
+OfColumns = Callable[[np.ndarray], np.ndarray]
+"""A function of columns, from ``(n, B)`` to ``(..., B)``."""
+
 
 def cores() -> int:
     """Return the number of cores that this process may use: its CPU affinity, limited by ``OMP_NUM_THREADS``."""

@@ -14,6 +14,7 @@ from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import noise
 from bench.model import IID, Answer, Design, Estimator, KnownOptimum, Optimizer, Problem, Rollout, zeroth_order
+from bench.model.blocks import OfColumns
 from bench.model.program import OWN
 from bench.run.shared import Shared
 
@@ -51,8 +52,8 @@ def advance(
     optimizer: Optimizer,
     state: dict[str, Any],
     normal: np.ndarray,
-    costs: Callable[[np.ndarray], np.ndarray],
-    gradients: Callable[[np.ndarray], np.ndarray],
+    costs: OfColumns,
+    gradients: OfColumns,
 ) -> dict[str, Any]:
     """Return the optimizer's state after one more iteration: the points it asks for, and what it requires there."""
     points = optimizer.ask(state, normal)
