@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.errors import needing_sweeps
-from bench.examine.diagnosis import LOOSE, Explanation, doubtful, grows, may_be_adaptive
+from bench.examine.diagnosis import LOOSE, Explanation, Horizon, doubtful, grows, may_be_adaptive
 from bench.examine.hints import Hint, hint_of
 from bench.examine.lines import ALIKE, LineScan
 from bench.examine.means import OF_A_DRAW, Mean
 from bench.examine.smoothing import TARGET_ERROR, Method, Smoothed
 from bench.examine.stages import Repeats, recaused
 from bench.examine.subspace import MOST
+from bench.examine.verdicts import in_order
 from bench.gradient import FAULTS, TRUSTED, Check, Part, Sample, rules
 from bench.gradient.direction import CHANCE, MIN_STEPS, resolution
 from bench.gradient.roughness import FINE
@@ -247,12 +248,12 @@ class Findings:
     def judged(self) -> Check:
         """The check with derivatives of a rough cost, or of one with adaptive steps, judged by its smooth part or a refined cost."""
         has_smooth_part = self.explained.wide or (self.explained.steps and self._agrees_with_refined)
-        if not has_smooth_part or self.tread or self._is_rough:
+        if not has_smooth_part or self.tread or self.is_rough:
             return self.check
         return recaused(self.check, self._of_smooth_part)
 
     @cached_property
-    def _is_rough(self) -> bool:
+    def is_rough(self) -> bool:
         """Whether an unsettled cost varies as much between neighbours as over a wide step, and the gradient does not say so.
 
         In chaos it does, and is not blamed.
@@ -366,7 +367,7 @@ class Findings:
         contradicted = [
             p
             for p in seen
-            if abs(p.program - p.difference) > CONTRADICTED * p.uncertainty
+            if self._is_contradicted(p)
             and p.error > DIGIT
             and p.uncertainty < DIGIT * abs(p.difference)
             and not self._is_small(replace(p, verdict="wrong_adjoint"))
@@ -396,7 +397,7 @@ class Findings:
             if p.verdict == "zero" and (allowed is None or not allowed[p.component])
         ]
 
-    @property
+    @cached_property
     def wrong_checks(self) -> list[Check]:
         """The failed checks: at theta, and under other noise."""
         return [one for one in [self.settled, *self.more] if one.parts and not one.trusted]
@@ -418,75 +419,89 @@ class Findings:
         lost = ((name, at, length) for name, t, costs, length in ways for at in t[~np.isfinite(costs)].tolist())
         return sorted((abs(at) * length, name, at) for name, at, length in lost)
 
+    def _is_contradicted(self, part: Part) -> bool:
+        """Return whether a difference contradicts a derivative beyond its error and all noise of equal calls."""
+        repeats = self.repeats
+        noise = repeats.of_gradient * np.linalg.norm([p.program for p in self.settled.components])
+        error = part.uncertainty + repeats.spread / part.step + noise
+        return bool(abs(part.program - part.difference) > CONTRADICTED * error)
+
+    # ------------------------------------------------------------------------- what the order of verdicts reads
+
     @property
-    def _exceeds_noise(self) -> bool:
+    def is_noisy(self) -> bool:
+        """Whether equal calls of the cost differ by more than a floor, and not because of the call before."""
+        return self.repeats.spread > self.repeats.floor and not self.repeats.has_state
+
+    @property
+    def exceeds_noise(self) -> bool:
         """Whether the gradient of a noisy cost is wrong; one with noise of its own by more than all noise makes."""
-        parts, repeats = self.settled.components, self.repeats
-        if self.settled.cause not in FAULTS or not repeats.of_gradient > repeats.floor_of_gradient:
-            return self.settled.cause in FAULTS
-        noise = repeats.of_gradient * np.linalg.norm([p.program for p in parts])
-        return any(
-            p.verdict in FAULTS
-            and abs(p.program - p.difference) > CONTRADICTED * (p.uncertainty + repeats.spread / p.step + noise)
-            for p in parts
+        is_noisy = self.repeats.of_gradient > self.repeats.floor_of_gradient
+        return self.settled.cause in FAULTS and (
+            not is_noisy or any(p.verdict in FAULTS and self._is_contradicted(p) for p in self.settled.components)
         )
 
-    def _verdicts(self) -> Iterator[tuple[str, bool, str]]:
-        """Yield each verdict about the derivative at theta, whether it holds, and its facts: the first that holds decides."""
-        repeats = self.repeats
-        yield "nondeterministic", repeats.is_failing, "equal calls raise an exception or return a number"
-        yield "raised", self.is_failed, shortened(self.error)
-        yield "undecided", not self.check.parts, self.n_checked
-        is_noisy = repeats.spread > repeats.floor and not repeats.has_state
-        yield "nondeterministic", repeats.is_large and not is_noisy, self.spread_text
-        is_noisy &= not self._exceeds_noise
-        yield "noisy", is_noisy, f"{self.spread_text}; {counted(len(self.resolved_parts), 'slope')} known to 10%"
-        if self.wrong_checks:
-            yield from self._verdicts_on_failed(self.wrong_checks[0].cause)
-        yield from self._verdicts_on_passed()
+    @cached_property
+    def failed(self) -> str:
+        """The verdict of the first failed check; empty if none failed."""
+        return self.wrong_checks[0].cause if self.wrong_checks else ""
 
-    def _verdicts_on_failed(self, failed: str) -> Iterator[tuple[str, bool, str]]:
-        """Yield the verdicts on a check that failed with a cause, the cause itself last."""
-        explained, numbers = self.explained, self.place if failed == "nonfinite" else self._failed_numbers
-        is_of_a_draw = self.is_random and failed in OF_A_DRAW and not self._is_of_draws
-        is_suspicious = failed in SUSPICIOUS
-        yield self._cause_of_mean, is_of_a_draw, self.mean_text
-        yield "staircase", is_suspicious and (self._is_on_tread or self.has_steps), numbers
-        yield "rough", failed == "unsettled" and self._is_rough, ""
-        yield "adaptive", failed == "unsettled" and bool(explained.wide), numbers
-        is_decided = bool(explained.wide) and (explained.refined is not None or self._is_averaged)
-        is_gap = failed in EXCUSABLE and not is_decided and self.is_discretisation_gap
-        loop = f", {explained.steps} has another length at other thetas" * bool(explained.steps)
-        yield "adaptive", is_gap, f"{numbers}{loop}"
-        is_grown = grows(explained.growth, self._tolerance_of_horizons)
-        yield "overwritten", is_grown and failed in (*UNEQUAL, "unsettled"), numbers
-        is_falling = self.hint is not None and self.hint.cause == "continuous_adjoint"
-        yield "continuous_adjoint", is_falling and is_suspicious, numbers
-        # adaptive steps may explain the error, and the budget ended before that was known
+    @property
+    def is_suspicious(self) -> bool:
+        """Whether a check failed with a cause that adaptive steps and kinks imitate."""
+        return self.failed in SUSPICIOUS
+
+    @property
+    def is_of_a_draw(self) -> bool:
+        """Whether the failure is at one draw of the cost's noise, which an estimator need not match."""
+        return self.is_random and self.failed in OF_A_DRAW and not self._is_of_draws
+
+    @property
+    def grows(self) -> bool:
+        """Whether the gradient is right after few steps, and its error grows with their number."""
+        return grows(self.explained.growth, self._tolerance_of_horizons)
+
+    @property
+    def is_falling(self) -> bool:
+        """Whether the error of the gradient falls with the number of steps."""
+        return self.hint is not None and self.hint.cause == "continuous_adjoint"
+
+    @property
+    def _is_decided(self) -> bool:
+        """Whether the slope of a rough cost's smooth part is known beyond doubt about its sequences of steps."""
+        return bool(self.explained.wide) and (self.explained.refined is not None or self._is_averaged)
+
+    @property
+    def may_be_explained(self) -> bool:
+        """Whether adaptive steps may explain the error, and the budget ended before that was known."""
+        explained = self.explained
         is_unknown = explained.is_adaptive is None and (bool(explained.steps) or may_be_adaptive(self.check))
         unseen = {part.name for part in doubtful(self.check.parts, self.groups)} - {*explained.smooth_parts}
-        is_open = explained.refined is None and not is_decided and (is_unknown or bool(explained.steps and unseen))
-        yield "undecided", is_open and is_suspicious, f"{numbers}: adaptive steps may explain it"
-        yield "unresolved", is_suspicious and self._is_slight, numbers
-        yield failed, True, numbers
+        return explained.refined is None and not self._is_decided and (is_unknown or bool(explained.steps and unseen))
 
-    def _verdicts_on_passed(self) -> Iterator[tuple[str, bool, str]]:
-        """Yield the verdicts where no check failed, that of the right derivative last."""
-        check, growth, tolerance = self.settled, self.explained.growth, self._tolerance_of_horizons
-        yield "undecided", not check.components or not self.is_complete, self.n_checked
-        # no larger step is left than that with the best central difference
-        yield "nonfinite", bool(self.failures) and self.failures[0][0] <= self.unit ** (1 / 3), self.place
-        yield "unresolved", bool(self.gradient and self.unresolved), "".join(map(self.numbers, self.unresolved[:1]))
-        late = max(growth, key=lambda one: one.error, default=None)
+    @property
+    def is_lost_nearby(self) -> bool:
+        """Whether the cost is not a number at a step up to that with the best central difference."""
+        return bool(self.failures) and self.failures[0][0] <= self.unit ** (1 / 3)
+
+    @property
+    def latest(self) -> Horizon | None:
+        """The most wrong of the compared numbers of steps; None if the gradient is right at all."""
+        growth, tolerance = self.explained.growth, self._tolerance_of_horizons
         is_late = any(one.is_wrong(tolerance) for one in growth)
-        text = f"after {late.steps} steps off by {number(100 * late.error)}%" if late else ""
-        yield "overwritten" if grows(growth, tolerance) else "missing_term", is_late, text
+        return max(growth, key=lambda one: one.error) if is_late else None
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether no input moves the cost, also around theta, and not all may do so."""
         allowed = self.setup.allow_zero
-        is_still = not self.moves_around
-        is_zero = all(part.verdict == "zero" for part in check.parts)
-        yield "constant", is_still and is_zero and (allowed is None or not allowed.all()), ""
-        yield "no_effect", is_still and allowed is not None and bool(self.zeros), ", ".join(self.zeros[:SHOWN])
-        yield "saturated" if check.cause == "zero" else check.cause, True, ""
+        is_zero = not self.moves_around and all(part.verdict == "zero" for part in self.settled.parts)
+        return is_zero and (allowed is None or not allowed.all())
+
+    @property
+    def has_useless_input(self) -> bool:
+        """Whether an input has no effect, also around theta, that ``allow_zero`` does not name."""
+        return not self.moves_around and self.setup.allow_zero is not None and bool(self.zeros)
 
     @property
     def _tolerance_of_horizons(self) -> float:
@@ -494,7 +509,7 @@ class Findings:
 
     @cached_property
     def _verdict(self) -> tuple[str, str]:
-        return next((cause, fact) for cause, holds, fact in self._verdicts() if holds)
+        return next((cause, fact) for cause, holds, fact in in_order(self) if holds)
 
     @property
     def derivative_cause(self) -> str:
@@ -517,6 +532,31 @@ class Findings:
         costs, gradients = number(self.repeats.spread), number(100 * self.repeats.of_gradient)
         state = ", the cost depends on the call before it" * self.repeats.has_state
         return f"costs differ by {costs}, gradients by {gradients}%{state}"
+
+    @property
+    def error_text(self) -> str:
+        """The first exception that the gradient raised, shortened to a headline."""
+        return shortened(self.error)
+
+    @property
+    def noisy_text(self) -> str:
+        """How far equal calls differ, and how many slopes are known nevertheless."""
+        return f"{self.spread_text}; {counted(len(self.resolved_parts), 'slope')} known to 10%"
+
+    @property
+    def loop_text(self) -> str:
+        """The loop whose length depends on theta; empty without one."""
+        return f", {self.explained.steps} has another length at other thetas" * bool(self.explained.steps)
+
+    @property
+    def late_text(self) -> str:
+        """How wrong the gradient is after the most wrong number of steps."""
+        return f"after {self.latest.steps} steps off by {number(100 * self.latest.error)}%" if self.latest else ""
+
+    @property
+    def zeros_text(self) -> str:
+        """The first inputs without any effect."""
+        return ", ".join(self.zeros[:SHOWN])
 
     @property
     def place(self) -> str:
@@ -560,12 +600,13 @@ class Findings:
         explained = self.explained
         return bool(explained.wide or explained.steps) or may_be_adaptive(self.check)
 
-    @property
-    def _failed_numbers(self) -> str:
-        """The numbers of the worst part of the failed check, and the explanation that fits."""
-        check, hint = self.wrong_checks[0], self.hint
-        text = self.numbers(check.worst_of(self.culprits)) if self.culprits else ""
-        return f"{text}, {hint.text}" if hint and check.cause in SUSPICIOUS else text
+    @cached_property
+    def failed_text(self) -> str:
+        """The numbers of the worst part of the failed check, and the explanation that fits; empty if none failed."""
+        if self.failed == "nonfinite":
+            return self.place
+        text = self.numbers(self.wrong_checks[0].worst_of(self.culprits)) if self.culprits else ""
+        return f"{text}, {self.hint.text}" if self.hint and self.is_suspicious else text
 
     def numbers(self, part: Part) -> str:
         """Return a part's numbers: the program's, the difference, and how far they are apart; at a kink both slopes."""
@@ -587,7 +628,7 @@ class Findings:
         return means is not None and means.is_of_draws and means.is_decisive and means.cause == "biased"
 
     @property
-    def _cause_of_mean(self) -> str:
+    def cause_of_mean(self) -> str:
         """The verdict on a gradient that is not the derivative of each draw, but may be an estimator."""
         if self.means is not None and self.means.is_decisive:
             return self.means.cause
@@ -607,7 +648,7 @@ class Findings:
         return "".join(f"its mean is off by {span(*one.bias_percent)}%, at sigma {one.sigma:g}" for one in known[:1])
 
     @property
-    def _is_on_tread(self) -> bool:
+    def is_on_tread(self) -> bool:
         """Whether the cost is constant at the smallest steps beside jumps: wider steps meet them, or the gradient is a residue."""
         parts = self.check.components or self.check.parts
         wrong = [part for part in parts if part.verdict in (*SUSPICIOUS, "unsettled")]
@@ -619,7 +660,7 @@ class Findings:
         )
 
     @property
-    def _is_slight(self) -> bool:
+    def is_slight(self) -> bool:
         """Whether the gradient has little of slopes that are so small beside right ones that a solver's error may make them."""
         check = self.wrong_checks[0]
         right = [abs(part.difference) * part.sample.scale for part in check.components if part.verdict in TRUSTED]
@@ -633,12 +674,14 @@ class Findings:
 
     @property
     def is_discretisation_gap(self) -> bool:
-        """Whether evidence of its own says that the gradient is that of another discretisation of the same problem.
+        """Whether evidence of its own says that a wrong gradient is that of another discretisation of the same problem.
 
         Either the gradient agrees with a refined cost where the cost's own differences do not, at every theta compared. Or
         the steps depend on theta, and the error is of the size of the jumps that this makes, or of a refined cost's gap.
         """
         is_varied = bool(self.explained.steps)
+        if self.failed not in EXCUSABLE or self._is_decided:
+            return False
         if self.explained.refined is None:
             return is_varied and bool(self.explained.is_adaptive)
         is_near = all(np.linalg.norm(gradient) <= AS_FAR * np.linalg.norm(own) for gradient, own in self._gaps)
