@@ -48,6 +48,8 @@ BEFORE_NOISE = 0.4
 """Largest share of the last stage on a gradient that looks right, where noise is measured after it."""
 STATE = 0.1
 """Largest share of the difference between histories by which a cost with equal histories differs."""
+CALLS, CALLS_OF_STATE = 8, 26
+"""Equal calls of a cost, and those that show a state: noise of two values looks like one in 8 calls once in 8, in 26 once in 30,000."""
 
 
 @dataclass
@@ -234,22 +236,28 @@ class GradientStages:
     def _repeat(self) -> None:
         """Repeat calls, after equal and after other thetas, and compare the results."""
         other, values = self.theta + 1e-3 * self.scale, [self.value]
-        is_other = (False, False, True, False, False, True, False, False)  # the first call was made before
         with self.clock.stage("repeating a call", self.left_out):
-            for each in is_other[1:]:
-                values.append(float(self.costs((other if each else self.theta)[:, None])[0]))
+            while len(values) < CALLS or (len(values) < CALLS_OF_STATE and self._compare_calls(values)):
+                at = other if len(values) % 3 == 2 else self.theta
+                values.append(float(self.costs(at[:, None])[0]))
         self._repeat_gradient(other)
-        for each in (False, True):
-            same = [value for value, one in zip(values, is_other, strict=False) if one == each]
+        self._repeated = len(values) >= CALLS
+        self.repeats.has_state = self._compare_calls(values) and len(values) == CALLS_OF_STATE
+
+    def _compare_calls(self, values: list[float]) -> bool:
+        """Record how far equal calls differ, and return whether they differ by the call before them alone, each time by as much.
+
+        Every third call is at another theta.
+        """
+        for same in (values[2::3], [*values[::3], *values[1::3]]):
             if len(same) > 1 and np.isfinite(same).all():
                 self.repeats.spread = max(self.repeats.spread, float(np.ptp(same)))
-        self._repeated = len(values) == len(is_other)
-        if (
-            self._repeated and self.repeats.spread > self.repeats.floor
-        ):  # last digits that vary at random are alike by chance
-            after_theta, after_other = values[4::3], values[3::3]
-            apart = STATE * abs(after_theta[-1] - after_other[-1])
-            self.repeats.has_state = bool(max(np.ptp(after_theta), np.ptp(after_other)) <= apart)
+        # last digits that vary at random are alike by chance
+        if len(values) < CALLS or self.repeats.spread <= self.repeats.floor:
+            return False
+        after_theta, after_other = values[4::3], values[3::3]
+        apart = STATE * abs(after_theta[-1] - after_other[-1])
+        return bool(max(np.ptp(after_theta), np.ptp(after_other)) <= apart)
 
     def _repeat_gradient(self, other: np.ndarray) -> None:
         """Compare the gradient with that of an equal call after one at ``other (d,)``, or in a batch with it."""

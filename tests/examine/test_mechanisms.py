@@ -89,6 +89,20 @@ def test_last_digits_that_vary_are_never_a_state():
         assert (report.status, report.repeats.has_state) == (0, False), seed
 
 
+@pytest.mark.parametrize("values", [16, 2])
+def test_noise_is_never_a_state(values):
+    """Two pairs of equal calls are often alike: of two values once in 8."""
+    for seed in range(40):
+        random = np.random.default_rng(seed)
+
+        def cost(x, random=random):
+            return swing(x) + 1e-3 * random.integers(values)
+
+        report = examine(cost, START, grad=slope, calls=60)
+        assert not report.repeats.has_state, seed
+        assert report.cause != "nondeterministic", seed
+
+
 @pytest.mark.parametrize(
     "cost",
     [
