@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.examine.few import ROUNDS, FewSteps
-from bench.examine.lines import LineScan, scan
+from bench.examine.lines import Break, LineScan, scan
 from bench.examine.stages import GradientStages
 from bench.examine.steps import changing_loop
 from bench.examine.subspace import choose
@@ -26,9 +26,9 @@ EXPLAINED, EXPLAINED_IF_SMALL = 25.0, 100.0
 jumps over its length, and its kinks' changes of slope. Of right gradients it reaches 22, since only six breaks of a line are known,
 and more where a solver's error is smooth: then it is small."""
 FEWEST_BREAKS = 3
-"""Fewest breaks on all lines that bound such a small error."""
-MOST_OF_CHANGE = 0.5
-"""Largest height of all jumps, as a share of the cost's change along a line, that adaptive steps make."""
+"""Fewest breaks on all lines that bound an error."""
+MOST_OF_CHANGE = 0.1
+"""Largest height of a jump, as a share of the cost's change along its line, that adaptive steps make: a larger one is an event."""
 SPREADS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8, 0.8)
 """Distances from theta, in units of each input's scale, at which the loops of the program are compared."""
 ELSEWHERE, AROUND = 2, 0.05
@@ -255,17 +255,15 @@ def is_adaptive(
     size = float(np.linalg.norm(error / stages.scale))
     if not 0.0 < size < np.inf:
         return False
-    if any(size <= EXPLAINED * _slope_of_breaks(line, stages.scale) for line in lines):
+    if _is_bound(size / EXPLAINED, lines, stages.scale):
         return True
     direction, noise = error / size, max(outcome.noise, stages.repeats.spread)
     line = scan(partial(stages.costs_along, direction), direction, noise, LONG, effort, stages.simulator.unit)
     lines = [*lines, line]
-    slope = max(_slope_of_breaks(one, stages.scale) for one in lines)
-    # a line whose jumps make up the cost shows events, and not what the solver's steps change
-    n_breaks = sum(len(one.breaks) for one in lines if _slope_of_breaks(one, stages.scale))
-    is_bounded = size > EXPLAINED_IF_SMALL * slope and n_breaks >= FEWEST_BREAKS
-    is_small = all(p.error <= NEAR for p in outcome.components if p.verdict in SUSPICIOUS)
-    return size <= EXPLAINED * slope or (relative_error(outcome) <= NEAR and is_small and not is_bounded)
+    if relative_error(outcome) > NEAR or any(p.error > NEAR for p in outcome.components if p.verdict in SUSPICIOUS):
+        return _is_bound(size / EXPLAINED, lines, stages.scale)
+    is_known = sum(len(_breaks_of_steps(one)) for one in lines) >= FEWEST_BREAKS
+    return not is_known or _is_bound(size / EXPLAINED_IF_SMALL, lines, stages.scale)
 
 
 def _error_vector(stages: GradientStages, outcome: Check) -> np.ndarray:
@@ -286,12 +284,18 @@ def _unit_vector(stages: GradientStages, part: Part) -> np.ndarray:
     return vector
 
 
-def _slope_of_breaks(line: LineScan, scale: np.ndarray) -> float:
-    """Return the sum of jumps over the length of a line, and of its kinks' changes of slope, per unit of the scales; 0 where
-    jumps make up the cost.
-    """
-    heights = sum(jump.size for jump in line.jumps)
-    if not heights <= MOST_OF_CHANGE * np.abs(np.diff(line.costs)).sum():
-        return 0.0
-    bends = sum(one.size for one in line.breaks if one.kind == "kink")
-    return float((heights / np.ptp(line.at) + bends) / np.linalg.norm(line.direction / scale))
+def _breaks_of_steps(line: LineScan) -> list[Break]:
+    """Return the kinks of a line and those of its jumps that a solver's steps make."""
+    most = MOST_OF_CHANGE * np.abs(np.diff(line.costs)).sum()
+    return [one for one in line.breaks if one.kind == "kink" or one.size <= most]
+
+
+def _is_bound(size: float, lines: Sequence[LineScan], scale: np.ndarray) -> bool:
+    """Return whether enough breaks bound an error: on one of the lines, jumps over its length and kinks have this slope in the scales."""
+    found = [_breaks_of_steps(line) for line in lines]
+    slopes = [
+        sum(one.size / (np.ptp(line.at) if one.kind == "jump" else 1.0) for one in breaks)
+        / np.linalg.norm(line.direction / scale)
+        for line, breaks in zip(lines, found, strict=True)
+    ]
+    return sum(map(len, found)) >= FEWEST_BREAKS and bool(size <= max(slopes))

@@ -264,8 +264,8 @@ EXAMINATION = {
         "gradient and differences differ by as much as the discretisation does, as with adaptive steps: neither is "
         "exactly the derivative of the solution",
         "`missing_term` or `wrong_adjoint` where a loop's length depends on theta, and the error is at most {diagnosis.EXPLAINED:g} times "
-        "the jumps and kinks of a line, as slopes over its length; or {diagnosis.EXPLAINED_IF_SMALL:g} times, or there are fewer than "
-        "{diagnosis.FEWEST_BREAKS}, where it and that of each wrong component are at most {diagnosis.NEAR:.0%}; lines whose jumps are above {diagnosis.MOST_OF_CHANGE:.0%} of the change do not count. With `refined`: the gradient is at "
+        "the slope of {diagnosis.FEWEST_BREAKS} or more jumps, over the length of a line, and kinks; or {diagnosis.EXPLAINED_IF_SMALL:g} times, or there are fewer "
+        "breaks, where it and that of each wrong component are at most {diagnosis.NEAR:.0%}; jumps above {diagnosis.MOST_OF_CHANGE:.0%} of the cost's change on their line are events and do not count. With `refined`: the gradient is at "
         "most {findings.AGREES:g} times as far from it as the differences at each theta, or {findings.AS_FAR:g} times beside such a loop. "
         "Of a rough cost: no slope over wide steps is known to {smooth_part.LIMIT:.0%}",
         "give the cost at a tighter tolerance; accept it if the gradient is meant to be that one's",
