@@ -104,7 +104,7 @@ class Explanation:
 
 def refined_slopes(stages: GradientStages, refined: Callable[..., Any]) -> RefinedSlopes:
     """Return the slopes of gradient, cost and refined cost at theta and :data:`ELSEWHERE`."""
-    other = stages.simulator.variant(refined)
+    other = stages.simulator.variant(refined, name="refined")
     random, eps = np.random.default_rng([stages.seed, 0x676170]), float(np.cbrt(stages.simulator.unit))
     components = np.stack([_unit_vector(stages, part) for part in stages.check.components], axis=1)
     around = random.standard_normal((stages.theta.size, min(ALONG, stages.theta.size)))
