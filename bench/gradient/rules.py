@@ -157,7 +157,7 @@ DERIVATIVE = {
     ),
     "rounding": Rule(
         "right",
-        "small steps have larger errors than the arithmetic explains, as with a loose solver tolerance",
+        "small steps have larger errors than the arithmetic explains, as with a loose solver tolerance or a gradient that is a long difference",
         "three smaller steps have errors above {direction.NOISY:g} times rounding, or the derivative is off by less than "
         "{check.LOOSE:.1%} of the largest and {check.EXPLAINED:g} times the jumps of a solver that stops early",
         "",
