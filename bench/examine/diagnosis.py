@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.examine.few import ROUNDS, FewSteps
-from bench.examine.lines import Break, LineScan, scan
+from bench.examine.lines import LineScan, scan
 from bench.examine.stages import GradientStages
 from bench.examine.steps import changing_loop
 from bench.examine.subspace import choose
@@ -140,10 +140,7 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
             space, costs, gradient, float(costs(stages.theta[:, None])[0]), simulator.unit, stages.repeats.spread
         )
         quick.run_round(ROUNDS[0], other.width)
-        outcome = quick.check()
-        if not outcome.parts:
-            continue
-        numbers = [(part.program, part.difference, part.uncertainty) for part in outcome.parts]
+        numbers = [(part.program, part.difference, part.uncertainty) for part in quick.check().parts]
         program, differences, doubts = np.array(numbers).T * space.scale
         size = float(np.abs(differences).max()) or 1.0
         norm = float(np.linalg.norm(gradient * stages.scale))
@@ -255,15 +252,17 @@ def is_adaptive(
     size = float(np.linalg.norm(error / stages.scale))
     if not 0.0 < size < np.inf:
         return False
-    if _is_bound(size / EXPLAINED, lines, stages.scale):
+    count, slope = _breaks_of_steps(lines, stages.scale)
+    if count >= FEWEST_BREAKS and size <= EXPLAINED * slope:
         return True
     direction, noise = error / size, max(outcome.noise, stages.repeats.spread)
     line = scan(partial(stages.costs_along, direction), direction, noise, LONG, effort, stages.simulator.unit)
-    lines = [*lines, line]
-    if relative_error(outcome) > NEAR or any(p.error > NEAR for p in outcome.components if p.verdict in SUSPICIOUS):
-        return _is_bound(size / EXPLAINED, lines, stages.scale)
-    is_known = sum(len(_breaks_of_steps(one)) for one in lines) >= FEWEST_BREAKS
-    return not is_known or _is_bound(size / EXPLAINED_IF_SMALL, lines, stages.scale)
+    count, slope = _breaks_of_steps([*lines, line], stages.scale)
+    wrong = [part.error for part in outcome.components if part.verdict in SUSPICIOUS]
+    is_small = max(relative_error(outcome), *wrong) <= NEAR
+    if count < FEWEST_BREAKS:
+        return is_small
+    return size <= (EXPLAINED_IF_SMALL if is_small else EXPLAINED) * slope
 
 
 def _error_vector(stages: GradientStages, outcome: Check) -> np.ndarray:
@@ -284,18 +283,16 @@ def _unit_vector(stages: GradientStages, part: Part) -> np.ndarray:
     return vector
 
 
-def _breaks_of_steps(line: LineScan) -> list[Break]:
-    """Return the kinks of a line and those of its jumps that a solver's steps make."""
-    most = MOST_OF_CHANGE * np.abs(np.diff(line.costs)).sum()
-    return [one for one in line.breaks if one.kind == "kink" or one.size <= most]
+def _breaks_of_steps(lines: Sequence[LineScan], scale: np.ndarray) -> tuple[int, float]:
+    """Return the number of kinks, and of jumps that a solver's steps make, and the largest slope of a line's in units of the scales.
 
-
-def _is_bound(size: float, lines: Sequence[LineScan], scale: np.ndarray) -> bool:
-    """Return whether enough breaks bound an error: on one of the lines, jumps over its length and kinks have this slope in the scales."""
-    found = [_breaks_of_steps(line) for line in lines]
-    slopes = [
-        sum(one.size / (np.ptp(line.at) if one.kind == "jump" else 1.0) for one in breaks)
-        / np.linalg.norm(line.direction / scale)
-        for line, breaks in zip(lines, found, strict=True)
-    ]
-    return sum(map(len, found)) >= FEWEST_BREAKS and bool(size <= max(slopes))
+    It is the sum of the jumps over the length of the line, and of the kinks' changes of slope.
+    """
+    count, slopes = 0, [0.0]
+    for line in lines:
+        most = MOST_OF_CHANGE * np.abs(np.diff(line.costs)).sum()
+        kinks = [one.size for one in line.breaks if one.kind == "kink"]
+        jumps = [one.size for one in line.jumps if one.size <= most]
+        count += len(kinks) + len(jumps)
+        slopes.append(float((sum(jumps) / np.ptp(line.at) + sum(kinks)) / np.linalg.norm(line.direction / scale)))
+    return count, max(slopes)

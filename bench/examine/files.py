@@ -41,16 +41,11 @@ def charts(report: Findings) -> list[Chart]:
     found = []
     if report.check.parts and report.gradient:
         parts = sorted(report.check.parts, key=lambda part: -np.nan_to_num(part.error, nan=np.inf))[:SHOWN]
-        steps = pd.concat(
+        steps = pd.DataFrame(
             [
-                pd.DataFrame(
-                    {
-                        "derivative": report.label(part),
-                        "step": part.sample.step / part.sample.scale,
-                        "error": part.sample.errors,
-                    }
-                )
+                {"derivative": report.label(part), "step": step, "error": error}
                 for part in parts
+                for step, error in zip(part.sample.step / part.sample.scale, part.sample.errors, strict=True)
             ]
         )
         found.append(
@@ -65,10 +60,11 @@ def charts(report: Findings) -> list[Chart]:
             )
         )
     if report.lines:
-        lines = pd.concat(
+        lines = pd.DataFrame(
             [
-                pd.DataFrame({"line": f"line {i + 1}", "t": line.at, "cost": line.costs})
+                {"line": f"line {i + 1}", "t": t, "cost": cost}
                 for i, line in enumerate(report.lines)
+                for t, cost in zip(line.at, line.costs, strict=True)
             ]
         )
         marks = [

@@ -85,7 +85,7 @@ def shortened(text: str) -> str:
 def _slope_nearby(sample: Sample) -> float:
     """Return the largest one-sided slope of a sample that exceeds its noise, less the noise."""
     slopes = np.maximum(np.abs(sample.left), np.abs(sample.right)) - 3.0 * sample.uncertainty
-    return float(np.nanmax(np.where(np.isfinite(slopes), slopes, 0.0), initial=0.0))
+    return float(slopes.max(initial=0.0, where=np.isfinite(slopes)))
 
 
 @dataclass(frozen=True)
@@ -453,18 +453,18 @@ class Findings:
 
     @property
     def is_of_a_draw(self) -> bool:
-        """Whether the failure is at one draw of the cost's noise, which an estimator need not match."""
-        return self.is_random and self.failed in OF_A_DRAW and not self._is_of_draws
+        """Whether the failure is at one draw of the cost's noise, which an estimator need not match.
+
+        A gradient that follows the slopes of the draws, and whose mean is off, is none.
+        """
+        means = self.means
+        follows = means is not None and means.is_of_draws and means.is_decisive and means.cause == "biased"
+        return self.is_random and self.failed in OF_A_DRAW and not follows
 
     @property
     def grows(self) -> bool:
         """Whether the gradient is right after few steps, and its error grows with their number."""
         return grows(self.explained.growth, self._tolerance_of_horizons)
-
-    @property
-    def is_falling(self) -> bool:
-        """Whether the error of the gradient falls with the number of steps."""
-        return self.hint is not None and self.hint.cause == "continuous_adjoint"
 
     @property
     def _is_decided(self) -> bool:
@@ -480,28 +480,11 @@ class Findings:
         return explained.refined is None and not self._is_decided and (is_unknown or bool(explained.steps and unseen))
 
     @property
-    def is_lost_nearby(self) -> bool:
-        """Whether the cost is not a number at a step up to that with the best central difference."""
-        return bool(self.failures) and self.failures[0][0] <= self.unit ** (1 / 3)
-
-    @property
     def latest(self) -> Horizon | None:
         """The most wrong of the compared numbers of steps; None if the gradient is right at all."""
         growth, tolerance = self.explained.growth, self._tolerance_of_horizons
         is_late = any(one.is_wrong(tolerance) for one in growth)
         return max(growth, key=lambda one: one.error) if is_late else None
-
-    @property
-    def is_constant(self) -> bool:
-        """Whether no input moves the cost, also around theta, and not all may do so."""
-        allowed = self.setup.allow_zero
-        is_zero = not self.moves_around and all(part.verdict == "zero" for part in self.settled.parts)
-        return is_zero and (allowed is None or not allowed.all())
-
-    @property
-    def has_useless_input(self) -> bool:
-        """Whether an input has no effect, also around theta, that ``allow_zero`` does not name."""
-        return not self.moves_around and self.setup.allow_zero is not None and bool(self.zeros)
 
     @property
     def _tolerance_of_horizons(self) -> float:
@@ -537,26 +520,6 @@ class Findings:
     def error_text(self) -> str:
         """The first exception that the gradient raised, shortened to a headline."""
         return shortened(self.error)
-
-    @property
-    def noisy_text(self) -> str:
-        """How far equal calls differ, and how many slopes are known nevertheless."""
-        return f"{self.spread_text}; {counted(len(self.resolved_parts), 'slope')} known to 10%"
-
-    @property
-    def loop_text(self) -> str:
-        """The loop whose length depends on theta; empty without one."""
-        return f", {self.explained.steps} has another length at other thetas" * bool(self.explained.steps)
-
-    @property
-    def late_text(self) -> str:
-        """How wrong the gradient is after the most wrong number of steps."""
-        return f"after {self.latest.steps} steps off by {number(100 * self.latest.error)}%" if self.latest else ""
-
-    @property
-    def zeros_text(self) -> str:
-        """The first inputs without any effect."""
-        return ", ".join(self.zeros[:SHOWN])
 
     @property
     def place(self) -> str:
@@ -620,12 +583,6 @@ class Findings:
         given = f"program {as_text(part.program)}, " if self.gradient else ""
         off = f", off by {number(100 * part.distance)}%" if self.gradient and math.isfinite(part.distance) else ""
         return f"{name}: {given}differences {as_text(part.difference)} +- {number(part.uncertainty, 1)}{off}"
-
-    @property
-    def _is_of_draws(self) -> bool:
-        """Whether a wrong gradient is that of each draw, since it follows their slopes and its mean is off."""
-        means = self.means
-        return means is not None and means.is_of_draws and means.is_decisive and means.cause == "biased"
 
     @property
     def cause_of_mean(self) -> str:
@@ -743,12 +700,6 @@ class Findings:
         return self.noise_found[0][0] if self.noise_found else ""
 
     @property
-    def is_measured(self) -> bool:
-        """Whether the bias of the mean gradient is decided at every sigma."""
-        is_whole = len(self.smoothed) >= len(self.setup.sigmas)
-        return is_whole and self._has_biases and all(one.decided for one in self.smoothed)
-
-    @property
     def _has_biases(self) -> bool:
         """Whether the bias of the mean gradient is known at the measured sigmas."""
         return bool(self.smoothed) and all(math.isfinite(one.bias) and one.known for one in self.smoothed)
@@ -763,7 +714,8 @@ class Findings:
         """Whether a line shows jumps that bias the gradient, and no measured bias says more."""
         # a part of the cost that is rounded everywhere is a fault of its own, however small
         if self.tread:
-            return self.missed > SEEN and not self.is_measured
+            is_measured = self._has_biases and len(self.smoothed) >= len(self.setup.sigmas)
+            return self.missed > SEEN and not (is_measured and all(one.decided for one in self.smoothed))
         return self.missed > TARGET_ERROR and not self._has_biases
 
     @property

@@ -21,6 +21,7 @@ from bench.examine.few import ROUNDS, FewSteps, is_nothing
 from bench.examine.subspace import Group, Subspace, choose, count_of, in_parts, locate
 from bench.gradient import EPS, FAULTS, TRUSTED, Check, Options, Part, check, step_sizes
 from bench.gradient.check import ELSEWHERE, NOTHING, cause_of
+from bench.gradient.direction import Function
 from bench.simulator.clock import OutOfTime
 from bench.simulator.simulator import Simulator
 
@@ -28,8 +29,8 @@ NOISE_POINTS = 17
 """Costs per direction that no step needs: the centre, and the points at which the noise is measured."""
 SCAN = 7 * 65
 """Number of costs of a staircase search along one direction that is not clearly right."""
-ALL_STEPS, FEW, MOST = "all steps and random directions", 2, 8
-"""Name of a later stage, and numbers of other thetas of the last ones."""
+FEW, MOST = 2, 8
+"""Numbers of other thetas of the last stages."""
 SMALL = 0.6
 """Power of the unit roundoff: a relative difference between equal calls below it is a floor, not a fault."""
 MANY = 10_000
@@ -132,7 +133,7 @@ class GradientStages:
         """Return the program's derivatives ``(n,)`` along a direction at theta + t * direction for t of n numbers."""
         return self._along(lambda thetas: direction @ self.gradients(thetas), direction, t)
 
-    def _along(self, function: Callable[[np.ndarray], np.ndarray], direction: np.ndarray, t: np.ndarray) -> np.ndarray:
+    def _along(self, function: Function, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
         def at(part: np.ndarray) -> np.ndarray:
             return function(self.theta[:, None] + direction[:, None] * part)
 
@@ -179,18 +180,8 @@ class GradientStages:
         if self.left_out:
             return
         self.repeat_failures()
-        if not self.is_failed:
-            self._run_stages(explain)
-
-    def repeat_failures(self) -> None:
-        """Repeat calls that raised an exception, which may do so at random; the repeats do not count as further exceptions."""
-        counts = deepcopy(self.simulator.raised)
-        with self.clock.stage("calls that raised an exception, once more", self.left_out):
-            for kind, *parts in list(self.simulator.failed):
-                self.repeats.is_failing |= bool(np.isfinite(getattr(self.simulator, kind)(*parts)).any())
-        self.simulator.raised = counts
-
-    def _run_stages(self, explain: Callable[[Check], None]) -> None:
+        if self.is_failed:
+            return
         space = choose(self.layout, self.scale, self.gradient, self.seed)
         self.groups = {group.name: group for group in space.groups}
         with self.clock.stage("the check at more than one step", self.left_out):
@@ -203,7 +194,15 @@ class GradientStages:
             return
         self._check_in_stages(space, explain)
         self._locate(space)
-        self._check_under_other_noise()
+        self._check_under_other_noise(space)
+
+    def repeat_failures(self) -> None:
+        """Repeat calls that raised an exception, which may do so at random; the repeats do not count as further exceptions."""
+        counts = deepcopy(self.simulator.raised)
+        with self.clock.stage("calls that raised an exception, once more", self.left_out):
+            for kind, *parts in list(self.simulator.failed):
+                self.repeats.is_failing |= bool(np.isfinite(getattr(self.simulator, kind)(*parts)).any())
+        self.simulator.raised = counts
 
     def _start(self) -> None:
         """Compute the cost at theta, once more, and the gradient."""
@@ -290,12 +289,12 @@ class GradientStages:
         def costs(*units: float) -> np.ndarray:
             return self.costs(first[:, None] + ulp[:, None] * np.array(units))
 
-        if not _are_equal(costs(0.0, IN_CELL)):
+        if np.ptp(costs(0.0, IN_CELL)):
             return False
         cells = costs(*range(CELLS))
         inside = costs(-IN_CELL, CELLS // 2 - IN_CELL, CELLS // 2 + IN_CELL)
-        is_constant = _are_equal(np.r_[cells[0], inside[0]]) and _are_equal(np.r_[cells[CELLS // 2], inside[1:]])
-        return is_constant and np.unique(cells).size >= DISTINCT_CELLS
+        is_constant = cells[0] == inside[0] and cells[CELLS // 2] == inside[1] == inside[2]
+        return bool(is_constant and np.unique(cells).size >= DISTINCT_CELLS)
 
     def _options(self, size: int, draws: int = -1) -> Options:
         """Return the options of the last stage with a number of other thetas, or by default those of more steps."""
@@ -346,7 +345,7 @@ class GradientStages:
             ]  # named by few thetas first, so that the name does not depend on the time that is left
         for count in draws:
             share = BEFORE_NOISE if self._has_noise and self.check.trusted else MOST_OF_IT
-            name = f"{count} other thetas" if count else ALL_STEPS
+            name = f"{count} other thetas" if count else "all steps and random directions"
             is_done = self._run_stage(name, space, self._options(space.size, count), share)
             if is_done != is_wrong:
                 break
@@ -406,11 +405,10 @@ class GradientStages:
             added = replace(outcome.parts[0], verdict=verdict, name=f"number {index}")
             self.check = replace(self.check, parts=(added, *self.check.parts))
 
-    def _check_under_other_noise(self) -> None:
+    def _check_under_other_noise(self, space: Subspace) -> None:
         """Check the gradient along random directions under other draws of the simulator's own noise."""
         if self.w is None or not self.check.trusted or self.is_quick:
             return
-        space = choose(self.layout, self.scale, self.gradient, self.seed)
         options = replace(self._options(space.size, 0), components=0, scanned=0, repeated=False)
         with self.clock.stage("checks under other noise", self.left_out):
             if not self.clock.can_afford(*self._cost_of(options, 0), share=SHARE):
@@ -418,10 +416,6 @@ class GradientStages:
             for _ in range(OTHER_NOISE):
                 w = self._random.standard_normal((self.simulator.noise, 1))
                 self.more.append(space.restore(self._check_once(space, options, w)))
-
-
-def _are_equal(values: np.ndarray) -> bool:
-    return bool(np.isfinite(values).all() and (values == values[0]).all())
 
 
 def _with_zeros(outcome: Check) -> Check:

@@ -279,9 +279,8 @@ def test_bad_settings_say_what_is_allowed(settings, match):
         examine(**{"cost": bowl, "theta": [1.0, 0.5]} | settings)
 
 
-@pytest.mark.parametrize("grad", [lambda x: 2 * x, "jax"])
-def test_a_tuple_of_one_number_is_a_cost(grad):
-    assert examine(lambda x: (x @ x,), [1.0, 0.5], grad=grad, calls=500).status == 0
+def test_a_tuple_of_one_number_is_a_cost():
+    assert examine(lambda x: (x @ x,), [1.0, 0.5], grad="jax", calls=500).status == 0
 
 
 @pytest.mark.parametrize(
