@@ -234,7 +234,7 @@ EXAMINATION = {
     "noisy": Rule(
         "open",
         "the cost draws noise of its own, which hides the slope",
-        "the spread of equal calls of the cost is above u^{stages.SMALL} of it and does not come from the call before, and nothing else is wrong; or the gradient has "
+        "the spread of equal calls of the cost is above u^{stages.SMALL} of it and does not come from the call before, in {stages.CALLS_OF_STATE} calls, and nothing else is wrong; or the gradient has "
         "noise too, and no difference is {findings.CONTRADICTED:g} errors, with those by noise, away from it",
         "fix the seed, or pass the noise as w and set noise=N",
         EXPECTED,
