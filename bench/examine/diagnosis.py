@@ -195,20 +195,16 @@ def step_of_difference(stages: GradientStages, outcome: Check) -> str:
     A gradient by differences with too long or too short a step is off by the error of that step.
     """
     wrong = [part for part in outcome.components if part.verdict in SUSPICIOUS][:DIFFERENCED]
-    if not wrong:
-        return ""
-    program = np.array([part.program for part in wrong])
-    allowed = SAME * np.abs(program - [part.difference for part in wrong])
-    index = [part.component or 0 for part in wrong]
-    steps = np.maximum(np.abs(stages.theta[index, None]), 1.0) * DIFFERENCE_STEPS
-    moved = np.zeros((stages.theta.size, 2, *steps.shape))
-    moved[index, :, np.arange(len(index))] = np.stack([-steps, steps], axis=1)
-    thetas = stages.theta[:, None] + moved.reshape(stages.theta.size, -1)
-    minus, plus = stages.costs(thetas).reshape(moved.shape[1:])
-    for name, slopes in (("forward", (plus - stages.value) / steps), ("central", (plus - minus) / (2 * steps))):
-        is_same = (np.abs(slopes - program[:, None]) <= allowed[:, None]).all(axis=0)
-        if is_same.any():
-            return f"{DIFFERENCE_STEPS[int(np.argmax(is_same))]:.0e} max(1, |x|), {name}"
+    is_same = np.full((2, DIFFERENCE_STEPS.size), bool(wrong))
+    for part in wrong:
+        steps = max(abs(float(stages.theta[part.component or 0])), 1.0) * DIFFERENCE_STEPS
+        costs = stages.costs_along(_unit_vector(stages, part), np.r_[-steps, steps])
+        minus, plus = np.split(costs, 2)
+        slopes = np.stack([(plus - stages.value) / steps, (plus - minus) / (2 * steps)])
+        is_same &= np.abs(slopes - part.program) <= SAME * abs(part.program - part.difference)
+    for name, row in zip(("forward", "central"), is_same, strict=True):
+        if row.any():
+            return f"{DIFFERENCE_STEPS[int(np.argmax(row))]:.0e} max(1, |x|), {name}"
     return ""
 
 

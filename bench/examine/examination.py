@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.errors import UserError, unknown
 from bench.examine import diagnosis
-from bench.examine.findings import NOISE_CAUSES, RELATIVE, GroupSize, Setup, Spent
+from bench.examine.facts import NOISE_CAUSES, RELATIVE, GroupSize, Setup, Spent
 from bench.examine.lines import HALVINGS, PLACES, POINTS, REACH, SIDES, LineScan, scan
 from bench.examine.means import OF_A_DRAW, Mean, compare_means
 from bench.examine.report import Report

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.examine.findings import FAILED, NONE, RIGHT, SEEN, Findings, as_text, shortened
+from bench.examine.facts import SEEN, as_text, shortened
+from bench.examine.findings import FAILED, NONE, RIGHT, Findings
 from bench.examine.lines import REACH
 from bench.examine.smoothing import PAIRS, TARGET_ERROR
 from bench.gradient import FAULTS

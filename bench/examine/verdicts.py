@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
+from bench.examine.facts import Facts
 from bench.gradient.rules import UNEQUAL
 from bench.report.text import counted, number
-
-if TYPE_CHECKING:
-    from bench.examine.findings import Findings
 
 MANY = 8
 """Most names in a list."""
 
 
-def in_order(f: Findings) -> Iterator[tuple[str, object, str]]:
-    """Yield each verdict, whether it holds for findings, and the facts behind it: the first that holds decides."""
+def in_order(f: Facts) -> Iterator[tuple[str, object, str]]:
+    """Yield each verdict, whether it holds for some facts, and the facts behind it: the first that holds decides."""
     noise = f"{f.spread_text}; {counted(len(f.resolved_parts), 'slope')} known to 10%"
     loop = f", {f.explained.steps} has another length at other thetas" * bool(f.explained.steps)
     # calls that fail or do not repeat
