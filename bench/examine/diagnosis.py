@@ -112,11 +112,11 @@ def refined_slopes(stages: GradientStages, refined: Callable[..., Any]) -> Refin
     rows = []
     for spread in (0.0, *[AROUND] * ELSEWHERE):
         theta = stages.theta + spread * stages.scale * random.standard_normal(stages.theta.size)
-        own, exact = (
-            stages.differences(theta, vectors, step, one)
-            for step, one in ((eps, stages.simulator), (REFINED * eps, other))
-        )
-        rows.append([stages.gradients(theta[:, None])[:, 0] @ vectors, own, exact])
+        slopes = [stages.gradients(theta[:, None])[:, 0] @ vectors]
+        for step, one in ((eps, stages.simulator), (REFINED * eps, other)):
+            sides = theta[:, None] + step * np.concatenate([vectors, -vectors], axis=1)
+            slopes.append(np.subtract(*np.split(stages.costs(sides, simulator=one), 2)) / (2.0 * step))
+        rows.append(slopes)
     return RefinedSlopes(*np.split(np.array(rows), [components.shape[1]], axis=2))
 
 

@@ -423,7 +423,7 @@ class _Examination:
         integrals, half = [], float(line.at[-1])
         for points in NODES:
             x, weights = np.polynomial.legendre.leggauss(points)
-            slopes = self.stages.slopes_along(line.direction, half * x)
+            slopes = self.stages.along(lambda at: line.direction @ self.stages.gradients(at), line.direction, half * x)
             lost = half * x[~np.isfinite(slopes)]
             if lost.size and np.isfinite(self.stages.costs_along(line.direction, lost)).any():
                 return replace(line, n_lost=lost.size)

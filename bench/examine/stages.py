@@ -127,25 +127,12 @@ class GradientStages:
 
     def costs_along(self, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Return the costs ``(n,)`` at theta + t * direction for t of n numbers."""
-        return self._along(self.costs, direction, t)
+        return self.along(self.costs, direction, t)
 
-    def slopes_along(self, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Return the program's derivatives ``(n,)`` along a direction at theta + t * direction for t of n numbers."""
-        return self._along(lambda thetas: direction @ self.gradients(thetas), direction, t)
-
-    def _along(self, function: Function, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
-        def at(part: np.ndarray) -> np.ndarray:
-            return function(self.theta[:, None] + direction[:, None] * part)
-
-        return in_parts(at, t.ravel(), self.simulator.width)
-
-    def differences(
-        self, theta: np.ndarray, vectors: np.ndarray, step: float, simulator: Simulator | None = None
-    ) -> np.ndarray:
-        """Return central differences ``(m,)`` at ``theta (d,)`` along ``vectors (d, m)``, of the cost or of another simulator."""
-        thetas = theta[:, None] + step * np.concatenate([vectors, -vectors], axis=1)
-        costs = self.costs(thetas, simulator=simulator)
-        return np.asarray(np.subtract(*np.split(costs, 2)) / (2.0 * step))
+    def along(self, function: Function, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Return a function of columns, ``(n,)``, at theta + t * direction for t of n numbers."""
+        theta, vector = self.theta[:, None], direction[:, None]
+        return in_parts(lambda part: function(theta + vector * part), t.ravel(), self.simulator.width)
 
     def gradients(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
         """Return the simulator's gradients at ``thetas (d, B)``, all under the same draw of its own noise."""
