@@ -22,6 +22,7 @@ from bench.gradient.roughness import FINE
 from bench.gradient.rules import EXCUSABLE, SUSPICIOUS, UNEQUAL
 from bench.gradient.smooth_part import CLEAR, LIMIT
 from bench.report.text import counted, number, span
+from bench.simulator.simulator import unit_of
 from bench.simulator.tree import ParameterTree
 
 if TYPE_CHECKING:
@@ -605,7 +606,7 @@ class Facts:
     @property
     def unit(self) -> float:
         """The unit roundoff of the cost's arithmetic."""
-        return 2.0**-7 if self.precision == "bfloat16" else float(np.finfo(self.precision).eps)
+        return unit_of(self.precision)
 
     @property
     def theta(self) -> np.ndarray:

@@ -54,6 +54,11 @@ def accepts(function: Callable[..., Any], *arguments: Any, **settings: Any) -> b
     return False
 
 
+def unit_of(dtype: str) -> float:
+    """Return the unit roundoff of a floating-point type by its name."""
+    return 2.0**-7 if dtype == "bfloat16" else float(np.finfo(dtype).eps)
+
+
 class Simulator:
     """A cost f(theta) or f(theta, w) and optionally its gradient, on NumPy batches with one sample per column.
 
@@ -177,8 +182,7 @@ class Simulator:
     @property
     def unit(self) -> float:
         """Unit roundoff of the least precise floating-point type between theta and the cost."""
-        types = {self.precision, *(leaf.dtype for leaf in self.layout.leaves)}
-        return max(float(np.finfo(name).eps) if name != "bfloat16" else 2.0**-7 for name in types)
+        return max(map(unit_of, [self.precision, *(leaf.dtype for leaf in self.layout.leaves)]))
 
     @property
     def width(self) -> int:
