@@ -272,7 +272,7 @@ EXAMINATION = {
         ("refined=COST", *EXPECTED),
     ),
 }
-"""Verdicts from all facts that ``examine`` has at theta, instead of the worst on a derivative."""
+"""Verdicts from all facts that ``examine`` has at theta, in the order of :mod:`bench.examine.verdicts`, instead of the worst on a derivative."""
 NOISE = {
     "jumps": Rule(
         "broken",
