@@ -110,7 +110,7 @@ def bounced(theta, factor):
     return bench.examine(bounce, theta, grad=gradient, calls=3000, progress=False)
 
 
-@pytest.mark.parametrize("theta", [[1.0, 0.5, 0.8], [0.9, 0.2, 0.85]])
+@pytest.mark.parametrize("theta", [[1.0, 0.5, 0.8], pytest.param([0.9, 0.2, 0.85], marks=pytest.mark.slow)])
 def test_jumps_of_events_do_not_bound_what_the_steps_of_a_solver_explain(theta):
     """The number of bounces makes up the cost on a long line, so that a few breaks there say nothing of the solver's steps."""
     report = bounced(theta, 1.0)
