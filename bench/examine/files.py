@@ -41,11 +41,16 @@ def charts(report: Findings) -> list[Chart]:
     found = []
     if report.check.parts and report.gradient:
         parts = sorted(report.check.parts, key=lambda part: -np.nan_to_num(part.error, nan=np.inf))[:SHOWN]
-        steps = pd.DataFrame(
+        steps = pd.concat(
             [
-                {"derivative": report.label(part), "step": step, "error": error}
+                pd.DataFrame(
+                    {
+                        "derivative": report.label(part),
+                        "step": part.sample.step / part.sample.scale,
+                        "error": part.sample.errors,
+                    }
+                )
                 for part in parts
-                for step, error in zip(part.sample.step / part.sample.scale, part.sample.errors, strict=True)
             ]
         )
         found.append(
@@ -60,11 +65,10 @@ def charts(report: Findings) -> list[Chart]:
             )
         )
     if report.lines:
-        lines = pd.DataFrame(
+        lines = pd.concat(
             [
-                {"line": f"line {i + 1}", "t": t, "cost": cost}
+                pd.DataFrame({"line": f"line {i + 1}", "t": line.at, "cost": line.costs})
                 for i, line in enumerate(report.lines)
-                for t, cost in zip(line.at, line.costs, strict=True)
             ]
         )
         marks = [
