@@ -26,9 +26,9 @@ EXPLAINED, EXPLAINED_IF_SMALL = 25.0, 100.0
 jumps over its length, and its kinks' changes of slope. Of right gradients it reaches 22, since only six breaks of a line are known,
 and more where a solver's error is smooth: then it is small."""
 FEWEST_BREAKS = 3
-"""Fewest breaks on all lines that bound such a small error."""
-MOST_OF_CHANGE = 0.5
-"""Largest height of all jumps, as a share of the cost's change along a line, that adaptive steps make."""
+"""Fewest breaks on all lines that bound an error."""
+MOST_OF_CHANGE = 0.1
+"""Largest height of a jump, as a share of the cost's change along its line, that adaptive steps make: a larger one is an event."""
 SPREADS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8, 0.8)
 """Distances from theta, in units of each input's scale, at which the loops of the program are compared."""
 ELSEWHERE, AROUND = 2, 0.05
@@ -104,7 +104,7 @@ class Explanation:
 
 def refined_slopes(stages: GradientStages, refined: Callable[..., Any]) -> RefinedSlopes:
     """Return the slopes of gradient, cost and refined cost at theta and :data:`ELSEWHERE`."""
-    other = stages.simulator.variant(refined)
+    other = stages.simulator.variant(refined, name="refined")
     random, eps = np.random.default_rng([stages.seed, 0x676170]), float(np.cbrt(stages.simulator.unit))
     components = np.stack([_unit_vector(stages, part) for part in stages.check.components], axis=1)
     around = random.standard_normal((stages.theta.size, min(ALONG, stages.theta.size)))
@@ -112,11 +112,11 @@ def refined_slopes(stages: GradientStages, refined: Callable[..., Any]) -> Refin
     rows = []
     for spread in (0.0, *[AROUND] * ELSEWHERE):
         theta = stages.theta + spread * stages.scale * random.standard_normal(stages.theta.size)
-        own, exact = (
-            stages.differences(theta, vectors, step, one)
-            for step, one in ((eps, stages.simulator), (REFINED * eps, other))
-        )
-        rows.append([stages.gradients(theta[:, None])[:, 0] @ vectors, own, exact])
+        slopes = [stages.gradients(theta[:, None])[:, 0] @ vectors]
+        for step, one in ((eps, stages.simulator), (REFINED * eps, other)):
+            sides = theta[:, None] + step * np.concatenate([vectors, -vectors], axis=1)
+            slopes.append(np.subtract(*np.split(stages.costs(sides, simulator=one), 2)) / (2.0 * step))
+        rows.append(slopes)
     return RefinedSlopes(*np.split(np.array(rows), [components.shape[1]], axis=2))
 
 
@@ -140,10 +140,7 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
             space, costs, gradient, float(costs(stages.theta[:, None])[0]), simulator.unit, stages.repeats.spread
         )
         quick.run_round(ROUNDS[0], other.width)
-        outcome = quick.check()
-        if not outcome.parts:
-            continue
-        numbers = [(part.program, part.difference, part.uncertainty) for part in outcome.parts]
+        numbers = [(part.program, part.difference, part.uncertainty) for part in quick.check().parts]
         program, differences, doubts = np.array(numbers).T * space.scale
         size = float(np.abs(differences).max()) or 1.0
         norm = float(np.linalg.norm(gradient * stages.scale))
@@ -198,20 +195,16 @@ def step_of_difference(stages: GradientStages, outcome: Check) -> str:
     A gradient by differences with too long or too short a step is off by the error of that step.
     """
     wrong = [part for part in outcome.components if part.verdict in SUSPICIOUS][:DIFFERENCED]
-    if not wrong:
-        return ""
-    program = np.array([part.program for part in wrong])
-    allowed = SAME * np.abs(program - [part.difference for part in wrong])
-    index = [part.component or 0 for part in wrong]
-    steps = np.maximum(np.abs(stages.theta[index, None]), 1.0) * DIFFERENCE_STEPS
-    moved = np.zeros((stages.theta.size, 2, *steps.shape))
-    moved[index, :, np.arange(len(index))] = np.stack([-steps, steps], axis=1)
-    thetas = stages.theta[:, None] + moved.reshape(stages.theta.size, -1)
-    minus, plus = stages.costs(thetas).reshape(moved.shape[1:])
-    for name, slopes in (("forward", (plus - stages.value) / steps), ("central", (plus - minus) / (2 * steps))):
-        is_same = (np.abs(slopes - program[:, None]) <= allowed[:, None]).all(axis=0)
-        if is_same.any():
-            return f"{DIFFERENCE_STEPS[int(np.argmax(is_same))]:.0e} max(1, |x|), {name}"
+    is_same = np.full((2, DIFFERENCE_STEPS.size), bool(wrong))
+    for part in wrong:
+        steps = max(abs(float(stages.theta[part.component or 0])), 1.0) * DIFFERENCE_STEPS
+        costs = stages.costs_along(_unit_vector(stages, part), np.r_[-steps, steps])
+        minus, plus = np.split(costs, 2)
+        slopes = np.stack([(plus - stages.value) / steps, (plus - minus) / (2 * steps)])
+        is_same &= np.abs(slopes - part.program) <= SAME * abs(part.program - part.difference)
+    for name, row in zip(("forward", "central"), is_same, strict=True):
+        if row.any():
+            return f"{DIFFERENCE_STEPS[int(np.argmax(row))]:.0e} max(1, |x|), {name}"
     return ""
 
 
@@ -255,17 +248,17 @@ def is_adaptive(
     size = float(np.linalg.norm(error / stages.scale))
     if not 0.0 < size < np.inf:
         return False
-    if any(size <= EXPLAINED * _slope_of_breaks(line, stages.scale) for line in lines):
+    count, slope = _breaks_of_steps(lines, stages.scale)
+    if count >= FEWEST_BREAKS and size <= EXPLAINED * slope:
         return True
     direction, noise = error / size, max(outcome.noise, stages.repeats.spread)
     line = scan(partial(stages.costs_along, direction), direction, noise, LONG, effort, stages.simulator.unit)
-    lines = [*lines, line]
-    slope = max(_slope_of_breaks(one, stages.scale) for one in lines)
-    # a line whose jumps make up the cost shows events, and not what the solver's steps change
-    n_breaks = sum(len(one.breaks) for one in lines if _slope_of_breaks(one, stages.scale))
-    is_bounded = size > EXPLAINED_IF_SMALL * slope and n_breaks >= FEWEST_BREAKS
-    is_small = all(p.error <= NEAR for p in outcome.components if p.verdict in SUSPICIOUS)
-    return size <= EXPLAINED * slope or (relative_error(outcome) <= NEAR and is_small and not is_bounded)
+    count, slope = _breaks_of_steps([*lines, line], stages.scale)
+    wrong = [part.error for part in outcome.components if part.verdict in SUSPICIOUS]
+    is_small = max(relative_error(outcome), *wrong) <= NEAR
+    if count < FEWEST_BREAKS:
+        return is_small
+    return size <= (EXPLAINED_IF_SMALL if is_small else EXPLAINED) * slope
 
 
 def _error_vector(stages: GradientStages, outcome: Check) -> np.ndarray:
@@ -286,12 +279,16 @@ def _unit_vector(stages: GradientStages, part: Part) -> np.ndarray:
     return vector
 
 
-def _slope_of_breaks(line: LineScan, scale: np.ndarray) -> float:
-    """Return the sum of jumps over the length of a line, and of its kinks' changes of slope, per unit of the scales; 0 where
-    jumps make up the cost.
+def _breaks_of_steps(lines: Sequence[LineScan], scale: np.ndarray) -> tuple[int, float]:
+    """Return the number of kinks, and of jumps that a solver's steps make, and the largest slope of a line's in units of the scales.
+
+    It is the sum of the jumps over the length of the line, and of the kinks' changes of slope.
     """
-    heights = sum(jump.size for jump in line.jumps)
-    if not heights <= MOST_OF_CHANGE * np.abs(np.diff(line.costs)).sum():
-        return 0.0
-    bends = sum(one.size for one in line.breaks if one.kind == "kink")
-    return float((heights / np.ptp(line.at) + bends) / np.linalg.norm(line.direction / scale))
+    count, slopes = 0, [0.0]
+    for line in lines:
+        most = MOST_OF_CHANGE * np.abs(np.diff(line.costs)).sum()
+        kinks = [one.size for one in line.breaks if one.kind == "kink"]
+        jumps = [one.size for one in line.jumps if one.size <= most]
+        count += len(kinks) + len(jumps)
+        slopes.append(float((sum(jumps) / np.ptp(line.at) + sum(kinks)) / np.linalg.norm(line.direction / scale)))
+    return count, max(slopes)

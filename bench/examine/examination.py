@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.errors import UserError, unknown
 from bench.examine import diagnosis
-from bench.examine.findings import NOISE_CAUSES, RELATIVE, GroupSize, Setup, Spent
+from bench.examine.facts import NOISE_CAUSES, RELATIVE, GroupSize, Setup, Spent
 from bench.examine.lines import HALVINGS, PLACES, POINTS, REACH, SIDES, LineScan, scan
 from bench.examine.means import OF_A_DRAW, Mean, compare_means
 from bench.examine.report import Report
@@ -28,6 +28,7 @@ from bench.examine.smoothing import (
     measure_smoothed,
 )
 from bench.examine.stages import GradientStages
+from bench.examine.subspace import Group
 from bench.gradient import FAULTS, Check
 from bench.gradient.rules import RULES, SUSPICIOUS
 from bench.simulator.clock import Clock, OutOfTime, parse_duration
@@ -246,7 +247,8 @@ class _Examination:
         stages.run(self._compare_early)
         checked = stages.check
         is_wrong = checked.cause in SUSPICIOUS
-        has_gradient = stages.gradient is not None
+        gradient = stages.gradient
+        has_gradient = gradient is not None
         self._find_smooth_parts(checked)
         if refined is not None and has_gradient and (is_wrong or explained.wide):
             self._explain("refined", "the refined cost", diagnosis.refined_slopes, refined)
@@ -283,7 +285,7 @@ class _Examination:
             check=checked,
             is_complete=stages.is_complete,
             located=stages.located,
-            groups=self._group_sizes(),
+            groups={k: self._size_of(v, gradient) for k, v in stages.groups.items() if gradient is not None},
             more=stages.more,
             explained=explained,
             is_random=simulator.noise > 0,
@@ -309,18 +311,12 @@ class _Examination:
         costs += 2 * lines * (POINTS + PLACES * (2 * HALVINGS + 2 * SIDES)) + n_sigmas * 2 * FIRM
         return costs, gradients + (lines * sum(NODES) + n_sigmas * 2 * FIRM) * self.simulator.has_gradient
 
-    def _group_sizes(self) -> dict[str, GroupSize]:
-        """Return, by name of a group of numbers, what errors of its numbers do to the slope along its direction."""
-        gradient, setup, sizes = self.stages.gradient, self.setup, dict[str, GroupSize]()
-        if gradient is None:
-            return sizes
-        for name, group in self.stages.groups.items():
-            part = slice(group.first, group.last)
-            slope, scale = np.abs(gradient[part]), setup.scale[part]
-            per_input = setup.tolerated(part, slope), slope
-            allowed, whole = (float(np.linalg.norm(scale * each)) for each in per_input)
-            sizes[name] = GroupSize(slope.size, allowed, whole)
-        return sizes
+    def _size_of(self, group: Group, gradient: np.ndarray) -> GroupSize:
+        """Return what errors of a group's numbers do to the slope along its direction."""
+        part, setup = slice(group.first, group.last), self.setup
+        slope = np.abs(gradient[part])
+        per_input = setup.tolerated(part, slope), slope
+        return GroupSize(slope.size, *(float(np.linalg.norm(setup.scale[part] * each)) for each in per_input))
 
     def _attempt(self, what: str, function: Callable[[], Any], share: float = 1.0) -> Any:
         """Return a function's result within a share of the remaining budget, or None where that ends."""
@@ -427,7 +423,7 @@ class _Examination:
         integrals, half = [], float(line.at[-1])
         for points in NODES:
             x, weights = np.polynomial.legendre.leggauss(points)
-            slopes = self.stages.slopes_along(line.direction, half * x)
+            slopes = self.stages.along(lambda at: line.direction @ self.stages.gradients(at), line.direction, half * x)
             lost = half * x[~np.isfinite(slopes)]
             if lost.size and np.isfinite(self.stages.costs_along(line.direction, lost)).any():
                 return replace(line, n_lost=lost.size)

@@ -8,14 +8,13 @@ order h^2 (Nocedal and Wright 2006, section 8.1). Further steps replace this bou
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from bench.examine.subspace import Subspace
 from bench.gradient.check import NOTHING, Check, Part, cause_of
-from bench.gradient.direction import ALIKE, MEASURED, Sample, finding_at, resolution, wrong
+from bench.gradient.direction import ALIKE, MEASURED, Function, Sample, finding_at, resolution, wrong
 
 ROUNDS = (1.0, 30.0, 0.1)
 """Steps of the rounds, in multiples of the cube root of the unit roundoff, at which rounding and curvature balance."""
@@ -34,7 +33,7 @@ class FewSteps:
     """Differences of a cost at one to three steps per coordinate of a space. Each finished difference is kept."""
 
     space: Subspace
-    cost: Callable[[np.ndarray], np.ndarray]
+    cost: Function
     """The cost, ``(d, B)`` to ``(B,)``."""
     gradient: np.ndarray | None
     """The gradient by theta, ``(d,)``."""

@@ -1,500 +1,43 @@
-"""The findings of an examination: facts, and the verdicts that follow from them by :data:`bench.gradient.rules.RULES`."""
+"""The findings of an examination: the verdicts that follow from its facts, and their tables."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bench.errors import needing_sweeps
-from bench.examine.diagnosis import LOOSE, Explanation, doubtful, grows, may_be_adaptive
-from bench.examine.hints import Hint, hint_of
-from bench.examine.lines import ALIKE, LineScan
-from bench.examine.means import OF_A_DRAW, Mean
+from bench.examine.diagnosis import may_be_adaptive
+from bench.examine.facts import CONTRADICTED, DIGIT, NOISE_CAUSES, SEEN, Facts
 from bench.examine.smoothing import TARGET_ERROR, Method, Smoothed
-from bench.examine.stages import Repeats, recaused
 from bench.examine.subspace import MOST
-from bench.gradient import FAULTS, TRUSTED, Check, Part, Sample, rules
-from bench.gradient.direction import CHANCE, MIN_STEPS, resolution
-from bench.gradient.roughness import FINE
-from bench.gradient.rules import EXCUSABLE, RULES, STATUS, SUSPICIOUS, UNEQUAL
-from bench.gradient.smooth_part import CLEAR, LIMIT
+from bench.examine.verdicts import in_order
+from bench.gradient import FAULTS, TRUSTED, Part, rules
+from bench.gradient.direction import CHANCE, resolution
+from bench.gradient.rules import RULES, STATUS, UNEQUAL
 from bench.report.text import counted, number, span
-from bench.simulator.tree import ParameterTree
 
 if TYPE_CHECKING:
     import pandas as pd
 
-RELATIVE = 0.01
-"""Default sigma of the line scans, and of a cost with its own noise, in units of each input's scale."""
-SEEN = 0.01
-"""Share of a cost's change along a line that the integral of the gradient may miss without a warning."""
-RESOLVED = 0.02
-"""Relative error of a difference, up to which it shows that a component is right."""
-DIGIT = 0.1
-"""Largest uncertainty of a difference that shows a derivative, relative to the derivative or to slopes nearby."""
-CONTRADICTED = 10.0
-"""Uncertainties of a difference from which a derivative is not called right, even if it is small beside the others."""
-SLIGHT = 1e-5
-"""Largest error of an unresolved derivative, relative to the largest derivative, both in units of the inputs' scales."""
-PART = 0.5
-"""Largest share of such a slope that the gradient has: a factor or a sign is wrong however small the slope."""
-DEVIATIONS = 4.0
-"""Standard deviations of the slope along a random direction that errors within the tolerance do not exceed."""
-SEEN_ALONE = 4.0
-"""Multiple of a slope's error from which the error of one number shows along most random directions."""
-AGREES = 0.5
-"""Largest distance of a gradient that agrees with a refined cost, relative to that of the cost's own differences."""
-AS_FAR = 4.0
-"""Largest such distance over all thetas together where the steps depend on theta, so that the gradient has its own error."""
-RESIDUE = 1e-4
-"""Largest change of the cost by a gradient, relative to the height of a jump, that is a residue of a solver."""
-TINY = 1e-8
-"""Scale of an input below which a slope that no difference shows counts, however small its change of the cost over the scale."""
 SHOWN = 8
 """Most numbers of theta in the table of breaks."""
-ROUGH = 0.1
-"""Share of the cost's change over the widest step that noise between neighbouring thetas makes up where a cost is rough."""
-HEADLINE = 200
-"""Most characters of an exception in a headline."""
 RIGHT, WRONG, UNSHOWN, BROKEN, NONE = "right", "wrong", "not shown", "undefined", "none given"
 """Answers about the derivative. ``undefined``: the cost has a jump or a kink at theta."""
 FAILED = (WRONG, UNSHOWN, BROKEN)
 """Answers that decide before noise does."""
-NOISE_CAUSES = ("staircase", "jumps", "nonfinite", "nan_gradient", "biased", "spread", "unmeasured")
-"""Causes around theta or under noise, the first one decides."""
 
 
-def as_text(value: float, digits: int = 6) -> str:
-    """Return a number as text; ``NaN`` where it is not a number."""
-    return "NaN" if math.isnan(value) else number(value, digits)
-
-
-def shortened(text: str) -> str:
-    """Return the first characters of a text on one line, for a headline."""
-    line = " ".join(text.split())
-    return line if len(line) <= HEADLINE else f"{line[:HEADLINE]} ..."
-
-
-@np.errstate(all="ignore")
-def _slope_nearby(sample: Sample) -> float:
-    """Return the largest one-sided slope of a sample that exceeds its noise, less the noise."""
-    slopes = np.maximum(np.abs(sample.left), np.abs(sample.right)) - 3.0 * sample.uncertainty
-    return float(np.nanmax(np.where(np.isfinite(slopes), slopes, 0.0), initial=0.0))
-
-
-@dataclass(frozen=True)
-class GroupSize:
-    """What errors of a group's numbers do to the slope along its random direction, in units of their scales."""
-
-    count: int
-    """Number of numbers n."""
-    allowed: float
-    """Norm of the tolerated errors of the numbers."""
-    slope: float
-    """Norm of the gradient of the numbers."""
-
-    @property
-    def tolerated(self) -> float:
-        """Largest error of the slope from errors of its numbers that are all within their tolerance.
-
-        The direction is random and of length 1, so the slope's error has a standard deviation of ``allowed / sqrt(n)``.
-        """
-        return min(DEVIATIONS / math.sqrt(self.count), 1.0) * self.allowed
-
-    def hidden(self, error: float) -> float:
-        """Return the error of one number that a slope with ``error`` may hide, relative to the numbers' root mean square."""
-        return SEEN_ALONE * error * self.count / self.slope if self.slope > 0 else math.inf
-
-
-@dataclass(frozen=True)
-class Setup:
-    """The settings of an examination, per entry of theta where they are arrays ``(d,)``."""
-
-    levels: Sequence[tuple[float, np.ndarray]]
-    """Each sigma as a number for tables, its largest entry, and as an array."""
-    scale: np.ndarray
-    rtol: np.ndarray
-    """Tolerated relative error of each derivative."""
-    atol: np.ndarray
-    """Tolerated absolute error of each derivative."""
-    allow_zero: np.ndarray | None
-    """Whether each input may have no effect; None: such inputs cause a warning."""
-    seed: int
-    horizons: tuple[int, ...]
-
-    def tolerated(self, index: Any, slopes: Any) -> Any:
-        """Return the largest errors of slopes by inputs that only cause a warning."""
-        return self.atol[index] + self.rtol[index] * np.abs(slopes)
-
-    @property
-    def sigmas(self) -> list[float]:
-        """The given values of sigma."""
-        return [level for level, _ in self.levels]
-
-    def shown(self, level: float) -> str:
-        """Return a sigma as text: its smallest and largest standard deviation above 0, or one number where they are the same."""
-        each = next((spread[spread > 0] for one, spread in self.levels if one == level), np.array([level]))
-        return span(float(each.min()), float(each.max()))
-
-    @property
-    def reach(self) -> float:
-        """One standard deviation on the lines: the largest sigma, or without one a share of the scale of each input."""
-        return max(self.sigmas, default=RELATIVE)
-
-
-@dataclass(frozen=True)
-class Spent:
-    """What an examination took, and its limits."""
-
-    costs: int
-    """Number of costs computed, one per theta."""
-    gradients: int
-    """Number of gradients computed, one per theta."""
-    seconds: float
-    """Time within the budget [s]."""
-    compile_s: float
-    """Time of first calls [s]."""
-    cost_s: float
-    """Time of one cost [s]."""
-    gradient_s: float
-    """Time of one gradient [s]; NaN without a gradient."""
-    budget: float
-    calls: float
-    """Limit of costs and gradients together."""
-
-
-@dataclass(frozen=True)
-class Findings:
+class Findings(Facts):
     """The facts about a cost and its gradient at one theta, and the verdicts that follow from them."""
-
-    name: str
-    """Name of the cost."""
-    gradient: str
-    """Source of the gradient: ``jax``, ``torch``, a function's name, or empty for differences only."""
-    layout: ParameterTree
-    cost: float
-    precision: str
-    batch: str
-    repeats: Repeats
-    setup: Setup
-    spent: Spent
-    check: Check
-    """The gradient check; without parts if it did not finish within the budget."""
-    is_complete: bool
-    """Whether every chosen component and group was checked."""
-    located: dict[str, tuple[int, int]]
-    """By name of a wrong group: the first of the numbers that cause its error, and the last + 1."""
-    groups: dict[str, GroupSize]
-    """By name of a group of numbers that move along one random direction: its size."""
-    more: Sequence[Check]
-    """Checks under further draws of the simulator's own noise."""
-    explained: Explanation
-    """Comparisons that explain a wrong gradient."""
-    is_random: bool
-    """Whether the cost has noise of its own."""
-    means: Mean | None
-    """The mean of a gradient that is not the derivative at a fixed draw of the cost's noise; None: not compared."""
-    lines: Sequence[LineScan]
-    smoothed: Sequence[Smoothed]
-    error: str
-    """The first exception that the gradient raised; empty if none."""
-    is_failed: bool
-    """Whether it did at theta."""
-    n_failed: int
-    """Number of gradient calls that raised an exception."""
-    printed: Sequence[str]
-    """The lines that cost and gradient printed."""
-    notes: Sequence[str]
-    left_out: Sequence[str]
-    """The parts of the examination that the budget did not allow."""
-    enough: tuple[float, float]
-    """Costs and gradients with which nothing is left out."""
-    expect: str = ""
-    """The known cause with which the report passes."""
-    command: str = ""
-    """The command line of this report, or empty."""
-    changes: Sequence[str] = ()
-    """Differences from the baseline."""
-    is_as_before: bool = False
-    """Whether there is a baseline and nothing is worse."""
-    takes_steps: bool = False
-    """Whether cost and gradient take ``steps``, a number of steps."""
 
     # ------------------------------------------------------------------------------------------ the derivative
 
     @cached_property
-    def settled(self) -> Check:
-        """The check with tolerated errors counted as right."""
-        if self.named.cause not in UNEQUAL:
-            return self.named
-        return recaused(self.named, lambda part: replace(part, verdict="nonlinear") if self._is_small(part) else part)
-
-    @cached_property
-    def named(self) -> Check:
-        """The check with the cause of :attr:`hint` as the verdict of wrong derivatives."""
-        check = self.judged
-        if self.hint is None:
-            return check
-        cause = self.hint.cause if self.hint.cause in SUSPICIOUS else "wrong_adjoint"
-        return recaused(check, lambda part: replace(part, verdict=cause) if part.verdict in SUSPICIOUS else part)
-
-    @cached_property
-    def judged(self) -> Check:
-        """The check with derivatives of a rough cost, or of one with adaptive steps, judged by its smooth part or a refined cost."""
-        has_smooth_part = self.explained.wide or (self.explained.steps and self._agrees_with_refined)
-        if not has_smooth_part or self.tread or self._is_rough:
-            return self.check
-        return recaused(self.check, self._of_smooth_part)
-
-    @cached_property
-    def _is_rough(self) -> bool:
-        """Whether an unsettled cost varies as much between neighbours as over a wide step, and the gradient does not say so.
-
-        In chaos it does, and is not blamed.
-        """
-        samples = [p.sample for one in [self.check, *self.more] if one.cause == "unsettled" for p in one.parts]
-        return any(
-            one.noise > ROUGH * np.abs(one.plus - one.minus)[one.finite].max(initial=0.0)
-            and one.noise > max(1e6 * one.unit * abs(one.centre), abs(one.derivative) * FINE * one.scale)
-            for one in samples
-        )
-
-    @property
-    def _is_averaged(self) -> bool:
-        """Whether wide steps meet several sequences of steps, along each wrong part: the slope over them is another than at tiny steps."""
-        smooth, wrong = self.explained.smooth_parts, {p.name for p in self.settled.parts if p.verdict in UNEQUAL}
-        known = [(part, wide) for part in self.check.parts if (wide := smooth.get(part.name))]
-        is_other = any(abs(wide.slope - part.difference) > wide.error + part.uncertainty for part, wide in known)
-        return is_other and wrong <= {part.name for part, _ in known}
-
-    @cached_property
-    def _refined(self) -> dict[str, float]:
-        """The refined cost's derivatives by component; empty without a refined cost."""
-        slopes = self.explained.refined.components[0, 2] if self.explained.refined else []
-        return {p.name: float(one) / p.sample.scale for p, one in zip(self.check.components, slopes, strict=False)}
-
-    def _of_smooth_part(self, part: Part) -> Part:
-        """Return a part of a rough cost with the verdict that wide steps, or a refined cost, give.
-
-        Random directions of all numbers and other thetas were compared at tiny steps only, which show nothing there.
-        """
-        explained, is_open = self.explained, part.verdict in (*UNEQUAL, "unsettled")
-        group, index = self.groups.get(part.name), part.component
-        if index is None and group is None:
-            return replace(part, verdict="smooth_part") if is_open or part.verdict in rules.BROKEN else part
-        wide, refined = explained.smooth_parts.get(part.name), self._refined.get(part.name)
-        is_known = wide is None and refined is None and (part.name in explained.smooth_parts or not is_open)
-        if is_known or not doubtful([part], self.groups):
-            return part
-        slope, error = (part.difference, math.inf) if wide is None else (wide.slope, wide.error)
-        if refined is not None:
-            size = max(abs(refined), abs(part.program))
-            slope, error = refined, min(abs(slope - refined) + error, LOOSE * size)
-        # the slope along a random direction may be 0 by chance
-        size = max(abs(slope), abs(part.program), group.slope / math.sqrt(group.count) if group else 0.0)
-        rtol, atol = (0.0, group.tolerated) if group else (self.setup.rtol[index], self.setup.atol[index])
-        tolerance, apart = max(float(rtol), resolution(self.unit)), abs(part.program - slope)
-        allowed = tolerance * size + float(atol)
-        is_rough = any(each.error > tolerance * abs(each.slope) for each in explained.wide)
-        doubt = CLEAR * error
-        if refined is None and is_rough and error <= allowed:
-            error = LOOSE * size  # of one sequence of steps, whose changes other parts show
-        if error > LIMIT * size or error < apart - allowed <= doubt:
-            verdict = "unsettled"
-        elif apart > error + allowed:
-            if not is_open and abs(part.program - part.difference) <= 2.0 * part.uncertainty:
-                return part  # right of one sequence of steps
-            verdict = part.verdict if part.verdict in UNEQUAL else "wrong_adjoint"
-        else:
-            verdict = "smooth_part" if error <= allowed or refined is not None else "coarse"
-        return replace(part, verdict=verdict, difference=slope, uncertainty=error)
-
-    @cached_property
-    def hint(self) -> Hint | None:
-        """The explanation of a wrong gradient that fits its numbers; None without one."""
-        return hint_of(self.judged, self.theta, self.explained)
-
-    @cached_property
-    def _tolerated(self) -> float:
-        """Largest error of a slope along a random direction of components and groups that are all within their tolerance."""
-        parts = self.check.components
-        sizes = [part.sample.scale * float(self.setup.tolerated(part.component, part.difference)) for part in parts]
-        sizes += [group.allowed for group in self.groups.values()]
-        return GroupSize(max(len(sizes), 1), float(np.linalg.norm(np.nan_to_num(sizes))), 0.0).tolerated
-
-    def _is_small(self, part: Part) -> bool:
-        """Return whether a wrong part's error is within the tolerance."""
-        if part.verdict not in UNEQUAL:
-            return False
-        group = self.groups.get(part.name)
-        if part.component is not None:
-            allowed = self.setup.tolerated(part.component, part.difference)
-        else:
-            allowed = group.tolerated if group else max(self._tolerated, self.setup.rtol.max() * abs(part.difference))
-        return bool(abs(part.program - part.difference) <= allowed)
-
-    @property
-    def small_errors(self) -> list[Part]:
-        """The parts with an error within the tolerance, the largest first."""
-        if self.check.cause not in UNEQUAL:
-            return []
-        return sorted(filter(self._is_small, self.check.parts), key=lambda part: -part.error)
-
-    @cached_property
-    def unresolved(self) -> list[Part]:
-        """The components that the check accepts, though differences cannot see them or contradict them.
-
-        A component is seen if its difference has one correct digit, compared with the derivative or with the slopes of
-        wider steps, which are not 0 at a minimum; one that is not small beside these has to be known to :data:`RESOLVED`. Unseen
-        components that are small do not count, unless their input is so small that it need not be its own scale.
-        """
-        parts = [p for p in self.settled.components if p.verdict in TRUSTED and p.verdict != "zero"]
-        sizes = {p.name: max(abs(p.difference), _slope_nearby(p.sample)) for p in parts}
-        seen = [p for p in parts if p.uncertainty < DIGIT * sizes[p.name]]
-        largest = max((abs(p.difference) * p.sample.scale for p in seen), default=0.0)
-        hidden = [
-            p
-            for p in parts
-            if (p.uncertainty >= RESOLVED * sizes[p.name] and abs(p.program) * p.sample.scale >= DIGIT * largest)
-            or (p not in seen and p.sample.scale < TINY)
-        ]
-        contradicted = [
-            p
-            for p in seen
-            if abs(p.program - p.difference) > CONTRADICTED * p.uncertainty
-            and p.error > DIGIT
-            and p.uncertainty < DIGIT * abs(p.difference)
-            and not self._is_small(replace(p, verdict="wrong_adjoint"))
-        ]
-        return hidden + contradicted
-
-    @property
-    def hidden(self) -> float:
-        """Relative error of one typical number that the check of its group may not show; 0 without groups."""
-        parts = [part for part in self.check.parts if part.name in self.groups]
-        errors = [
-            self.groups[part.name].hidden(
-                max(abs(part.program - part.difference), CONTRADICTED * part.uncertainty + part.sample.doubt)
-            )
-            for part in parts
-            if part.verdict in TRUSTED or self._is_small(part)
-        ]
-        return max((error for error in errors if math.isfinite(error)), default=0.0)
-
-    @property
-    def zeros(self) -> list[str]:
-        """The inputs without any effect that ``allow_zero`` does not name."""
-        allowed = self.setup.allow_zero
-        return [
-            self.label(p)
-            for p in self.check.components
-            if p.verdict == "zero" and (allowed is None or not allowed[p.component])
-        ]
-
-    @property
-    def wrong_checks(self) -> list[Check]:
-        """The failed checks: at theta, and under other noise."""
-        return [one for one in [self.settled, *self.more] if one.parts and not one.trusted]
-
-    @cached_property
-    def failures(self) -> list[tuple[float, str, float]]:
-        """Where the cost is not a number or raises an exception: distance in units of the scales, name, displacement.
-
-        The nearest place is first.
-        """
-        ways = []
-        for part in self.check.parts:
-            one = part.sample
-            steps, costs = np.r_[-one.step, one.step], np.r_[one.minus, one.plus]
-            ways.append((self.label(part), steps, costs, 1.0 / one.scale))
-        for index, line in enumerate(self.lines, 1):
-            length = float(np.linalg.norm(line.direction / self.setup.scale))
-            ways.append((f"t on line {index}", line.at, line.costs, length))
-        lost = ((name, at, length) for name, t, costs, length in ways for at in t[~np.isfinite(costs)].tolist())
-        return sorted((abs(at) * length, name, at) for name, at, length in lost)
-
-    @property
-    def _exceeds_noise(self) -> bool:
-        """Whether the gradient of a noisy cost is wrong; one with noise of its own by more than all noise makes."""
-        parts, repeats = self.settled.components, self.repeats
-        if self.settled.cause not in FAULTS or not repeats.of_gradient > repeats.floor_of_gradient:
-            return self.settled.cause in FAULTS
-        noise = repeats.of_gradient * np.linalg.norm([p.program for p in parts])
-        return any(
-            p.verdict in FAULTS
-            and abs(p.program - p.difference) > CONTRADICTED * (p.uncertainty + repeats.spread / p.step + noise)
-            for p in parts
-        )
-
-    def _verdicts(self) -> Iterator[tuple[str, bool, str]]:
-        """Yield each verdict about the derivative at theta, whether it holds, and its facts: the first that holds decides."""
-        repeats = self.repeats
-        yield "nondeterministic", repeats.is_failing, "equal calls raise an exception or return a number"
-        yield "raised", self.is_failed, shortened(self.error)
-        yield "undecided", not self.check.parts, self.n_checked
-        is_noisy = repeats.spread > repeats.floor and not repeats.has_state
-        yield "nondeterministic", repeats.is_large and not is_noisy, self.spread_text
-        is_noisy &= not self._exceeds_noise
-        yield "noisy", is_noisy, f"{self.spread_text}; {counted(len(self.resolved_parts), 'slope')} known to 10%"
-        if self.wrong_checks:
-            yield from self._verdicts_on_failed(self.wrong_checks[0].cause)
-        yield from self._verdicts_on_passed()
-
-    def _verdicts_on_failed(self, failed: str) -> Iterator[tuple[str, bool, str]]:
-        """Yield the verdicts on a check that failed with a cause, the cause itself last."""
-        explained, numbers = self.explained, self.place if failed == "nonfinite" else self._failed_numbers
-        is_of_a_draw = self.is_random and failed in OF_A_DRAW and not self._is_of_draws
-        is_suspicious = failed in SUSPICIOUS
-        yield self._cause_of_mean, is_of_a_draw, self.mean_text
-        yield "staircase", is_suspicious and (self._is_on_tread or self.has_steps), numbers
-        yield "rough", failed == "unsettled" and self._is_rough, ""
-        yield "adaptive", failed == "unsettled" and bool(explained.wide), numbers
-        is_decided = bool(explained.wide) and (explained.refined is not None or self._is_averaged)
-        is_gap = failed in EXCUSABLE and not is_decided and self.is_discretisation_gap
-        loop = f", {explained.steps} has another length at other thetas" * bool(explained.steps)
-        yield "adaptive", is_gap, f"{numbers}{loop}"
-        is_grown = grows(explained.growth, self._tolerance_of_horizons)
-        yield "overwritten", is_grown and failed in (*UNEQUAL, "unsettled"), numbers
-        is_falling = self.hint is not None and self.hint.cause == "continuous_adjoint"
-        yield "continuous_adjoint", is_falling and is_suspicious, numbers
-        # adaptive steps may explain the error, and the budget ended before that was known
-        is_unknown = explained.is_adaptive is None and (bool(explained.steps) or may_be_adaptive(self.check))
-        unseen = {part.name for part in doubtful(self.check.parts, self.groups)} - {*explained.smooth_parts}
-        is_open = explained.refined is None and not is_decided and (is_unknown or bool(explained.steps and unseen))
-        yield "undecided", is_open and is_suspicious, f"{numbers}: adaptive steps may explain it"
-        yield "unresolved", is_suspicious and self._is_slight, numbers
-        yield failed, True, numbers
-
-    def _verdicts_on_passed(self) -> Iterator[tuple[str, bool, str]]:
-        """Yield the verdicts where no check failed, that of the right derivative last."""
-        check, growth, tolerance = self.settled, self.explained.growth, self._tolerance_of_horizons
-        yield "undecided", not check.components or not self.is_complete, self.n_checked
-        # no larger step is left than that with the best central difference
-        yield "nonfinite", bool(self.failures) and self.failures[0][0] <= self.unit ** (1 / 3), self.place
-        yield "unresolved", bool(self.gradient and self.unresolved), "".join(map(self.numbers, self.unresolved[:1]))
-        late = max(growth, key=lambda one: one.error, default=None)
-        is_late = any(one.is_wrong(tolerance) for one in growth)
-        text = f"after {late.steps} steps off by {number(100 * late.error)}%" if late else ""
-        yield "overwritten" if grows(growth, tolerance) else "missing_term", is_late, text
-        allowed = self.setup.allow_zero
-        is_still = not self.moves_around
-        is_zero = all(part.verdict == "zero" for part in check.parts)
-        yield "constant", is_still and is_zero and (allowed is None or not allowed.all()), ""
-        yield "no_effect", is_still and allowed is not None and bool(self.zeros), ", ".join(self.zeros[:SHOWN])
-        yield "saturated" if check.cause == "zero" else check.cause, True, ""
-
-    @property
-    def _tolerance_of_horizons(self) -> float:
-        return max(float(self.setup.rtol.max()), 1e-3)
-
-    @cached_property
     def _verdict(self) -> tuple[str, str]:
-        return next((cause, fact) for cause, holds, fact in self._verdicts() if holds)
+        return next((cause, fact) for cause, holds, fact in in_order(self) if holds)
 
     @property
     def derivative_cause(self) -> str:
@@ -507,36 +50,12 @@ class Findings:
         return self._verdict[1]
 
     @property
-    def n_checked(self) -> str:
-        """How many components were checked, ``2 of 3 components``."""
-        return f"{len(self.check.components)} of {counted(self.theta.size, 'component')}"
-
-    @property
-    def spread_text(self) -> str:
-        """How far equal calls differ."""
-        costs, gradients = number(self.repeats.spread), number(100 * self.repeats.of_gradient)
-        state = ", the cost depends on the call before it" * self.repeats.has_state
-        return f"costs differ by {costs}, gradients by {gradients}%{state}"
-
-    @property
-    def place(self) -> str:
-        """The nearest place where the cost is not a number; empty without one."""
-        if not math.isfinite(self.cost):
-            return f"the cost at theta itself is {as_text(self.cost)}"
-        inputs = [self.label(part) for part in self.check.components]
-        known = [place for place in self.failures if place[1] in inputs] or self.failures
-        return "".join(f"nearest at {name} {at:+.2g}" for _, name, at in known[:1])
-
-    @property
-    def culprits(self) -> list[Part]:
-        """The worst parts of the failed check that name an input: located groups, then components, then directions."""
-        if not self.wrong_checks:
-            return []
-        check = self.wrong_checks[0]
-        located = [part for part in check.parts if part.name in self.located]
-        inside = [part for part in check.worst_parts if part.component is not None]
-        exact = [part for part in inside if part.component in self._located_numbers]
-        return exact or [*located, *inside] or list(check.worst_parts)
+    def derivative(self) -> str:
+        """The answer about the derivative at theta: one of ``right``, ``wrong``, ``not shown``, ``undefined``, ``none given``."""
+        if self.derivative_cause in rules.BROKEN:
+            return BROKEN
+        kind = RULES[self.derivative_cause].kind
+        return {"open": UNSHOWN, "right": RIGHT if self.gradient else NONE}.get(kind, WRONG)
 
     @property
     def suspects(self) -> list[str]:
@@ -551,116 +70,36 @@ class Findings:
         return list(dict.fromkeys(names))
 
     @property
-    def _located_numbers(self) -> set[int]:
-        return {first for first, last in self.located.values() if last - first == 1}
-
-    @property
     def can_refine(self) -> bool:
         """Whether a refined cost can show that the error is one of the discretisation."""
         explained = self.explained
         return bool(explained.wide or explained.steps) or may_be_adaptive(self.check)
 
     @property
-    def _failed_numbers(self) -> str:
-        """The numbers of the worst part of the failed check, and the explanation that fits."""
-        check, hint = self.wrong_checks[0], self.hint
-        text = self.numbers(check.worst_of(self.culprits)) if self.culprits else ""
-        return f"{text}, {hint.text}" if hint and check.cause in SUSPICIOUS else text
-
-    def numbers(self, part: Part) -> str:
-        """Return a part's numbers: the program's, the difference, and how far they are apart; at a kink both slopes."""
-        name = self.label(part)
-        if part.name in self.located:
-            name = f"{self.layout.block(*self.located[part.name])}, along a random direction"
-        if part.verdict == "jump":
-            return name
-        if part.verdict == "kink":
-            return f"{name}: slopes {number(part.left, 4)} and {number(part.right, 4)}"
-        given = f"program {as_text(part.program)}, " if self.gradient else ""
-        off = f", off by {number(100 * part.distance)}%" if self.gradient and math.isfinite(part.distance) else ""
-        return f"{name}: {given}differences {as_text(part.difference)} +- {number(part.uncertainty, 1)}{off}"
+    def small_errors(self) -> list[Part]:
+        """The parts with an error within the tolerance, the largest first."""
+        if self.check.cause not in UNEQUAL:
+            return []
+        return sorted(filter(self._is_small, self.check.parts), key=lambda part: -part.error)
 
     @property
-    def _is_of_draws(self) -> bool:
-        """Whether a wrong gradient is that of each draw, since it follows their slopes and its mean is off."""
-        means = self.means
-        return means is not None and means.is_of_draws and means.is_decisive and means.cause == "biased"
+    def resolution(self) -> float:
+        """The smallest relative error that these differences detect."""
+        errors = [CHANCE * p.uncertainty / abs(p.difference) for p in self.resolved_parts]
+        return max([resolution(self.unit), *errors])
 
     @property
-    def _cause_of_mean(self) -> str:
-        """The verdict on a gradient that is not the derivative of each draw, but may be an estimator."""
-        if self.means is not None and self.means.is_decisive:
-            return self.means.cause
-        causes = [one.cause or ("estimator" if one.is_usable else "spread") for one in self.smoothed]
-        return min(causes, key=(*NOISE_CAUSES, "estimator").index, default="unmeasured")
-
-    @property
-    def mean_text(self) -> str:
-        """By how much the mean of a gradient over draws is off."""
-        means = self.means
-        if means is not None and means.n_lost:
-            return f"at {means.n_lost} of {means.draws} draws"
-        if means is not None and means.is_decisive:
-            off = span(100 * max(means.error - means.doubt, 0.0), 100 * (means.error + means.doubt))
-            return f"its mean over {means.draws} draws is off by {off}%"
-        known = [one for one in self.smoothed if one.known]
-        return "".join(f"its mean is off by {span(*one.bias_percent)}%, at sigma {one.sigma:g}" for one in known[:1])
-
-    @property
-    def _is_on_tread(self) -> bool:
-        """Whether the cost is constant at the smallest steps beside jumps: wider steps meet them, or the gradient is a residue."""
-        parts = self.check.components or self.check.parts
-        wrong = [part for part in parts if part.verdict in (*SUSPICIOUS, "unsettled")]
-        height = max((jump.size for line in self.lines for jump in line.jumps), default=0.0)
-        return bool(height and wrong) and all(
-            not part.sample.differences[-MIN_STEPS:].any()
-            and (part.sample.differences.any() or abs(part.program) * part.sample.scale <= RESIDUE * height)
-            for part in wrong
-        )
-
-    @property
-    def _is_slight(self) -> bool:
-        """Whether the gradient has little of slopes that are so small beside right ones that a solver's error may make them."""
-        check = self.wrong_checks[0]
-        right = [abs(part.difference) * part.sample.scale for part in check.components if part.verdict in TRUSTED]
-        largest = max(right, default=0.0)
-        wrong = [part for part in (*check.parts, *check.draws) if part.verdict in UNEQUAL]
-        return bool(wrong) and all(
-            abs(part.program - part.difference) * part.sample.scale <= SLIGHT * largest
-            and abs(part.program) <= PART * abs(part.difference)
-            for part in wrong
-        )
-
-    @property
-    def is_discretisation_gap(self) -> bool:
-        """Whether evidence of its own says that the gradient is that of another discretisation of the same problem.
-
-        Either the gradient agrees with a refined cost where the cost's own differences do not, at every theta compared. Or
-        the steps depend on theta, and the error is of the size of the jumps that this makes, or of a refined cost's gap.
-        """
-        is_varied = bool(self.explained.steps)
-        if self.explained.refined is None:
-            return is_varied and bool(self.explained.is_adaptive)
-        is_near = all(np.linalg.norm(gradient) <= AS_FAR * np.linalg.norm(own) for gradient, own in self._gaps)
-        return self._agrees_with_refined or (is_varied and is_near)
-
-    @property
-    def _agrees_with_refined(self) -> bool:
-        """Whether the gradient agrees with a refined cost where the cost's own differences do not, at every theta compared."""
-        return bool(self._gaps) and all((gradient <= AGREES * own).all() for gradient, own in self._gaps)
-
-    @cached_property
-    def _gaps(self) -> list[np.ndarray]:
-        """Distances by theta of gradient and of own differences from a refined cost: by component, and along random directions."""
-        return [np.linalg.norm(slopes[:, :2] - slopes[:, 2:], axis=2).T for slopes in self.explained.refined or ()]
-
-    @property
-    def derivative(self) -> str:
-        """The answer about the derivative at theta: one of ``right``, ``wrong``, ``not shown``, ``undefined``, ``none given``."""
-        if self.derivative_cause in rules.BROKEN:
-            return BROKEN
-        kind = RULES[self.derivative_cause].kind
-        return {"open": UNSHOWN, "right": RIGHT if self.gradient else NONE}.get(kind, WRONG)
+    def hidden(self) -> float:
+        """Relative error of one typical number that the check of its group may not show; 0 without groups."""
+        parts = [part for part in self.check.parts if part.name in self.groups]
+        errors = [
+            self.groups[part.name].hidden(
+                max(abs(part.program - part.difference), CONTRADICTED * part.uncertainty + part.sample.doubt)
+            )
+            for part in parts
+            if part.verdict in TRUSTED or self._is_small(part)
+        ]
+        return max((error for error in errors if math.isfinite(error)), default=0.0)
 
     # ---------------------------------------------------------------------------------------------- under noise
 
@@ -700,12 +139,6 @@ class Findings:
         return self.noise_found[0][0] if self.noise_found else ""
 
     @property
-    def is_measured(self) -> bool:
-        """Whether the bias of the mean gradient is decided at every sigma."""
-        is_whole = len(self.smoothed) >= len(self.setup.sigmas)
-        return is_whole and self._has_biases and all(one.decided for one in self.smoothed)
-
-    @property
     def _has_biases(self) -> bool:
         """Whether the bias of the mean gradient is known at the measured sigmas."""
         return bool(self.smoothed) and all(math.isfinite(one.bias) and one.known for one in self.smoothed)
@@ -720,24 +153,9 @@ class Findings:
         """Whether a line shows jumps that bias the gradient, and no measured bias says more."""
         # a part of the cost that is rounded everywhere is a fault of its own, however small
         if self.tread:
-            return self.missed > SEEN and not self.is_measured
+            is_measured = self._has_biases and len(self.smoothed) >= len(self.setup.sigmas)
+            return self.missed > SEEN and not (is_measured and all(one.decided for one in self.smoothed))
         return self.missed > TARGET_ERROR and not self._has_biases
-
-    @property
-    def has_steps(self) -> bool:
-        """Whether the cost is constant between jumps on a line."""
-        return any(line.steps for line in self.lines)
-
-    @property
-    def moves_around(self) -> bool:
-        """Whether theta moves the cost beside a flat part at theta: by jumps on a line, or under noise."""
-        return any(line.jumps for line in self.lines) or any(one.n_moved for one in self.smoothed)
-
-    @property
-    def tread(self) -> float:
-        """Height of the jumps, if all lines have equal, evenly spaced jumps; else 0."""
-        treads = [line.tread for line in self.lines] or [0.0]
-        return max(treads) if min(treads) > (1 - ALIKE) * max(treads) else 0.0
 
     @property
     def use(self) -> str:
@@ -747,6 +165,15 @@ class Findings:
         if self.noise_cause or not self.smoothed or any(one.cause for one in self.smoothed):
             return "not measured"
         return "usable" if self._has_biases else "not shown"
+
+    def recommended(self, one: Smoothed) -> Method | None:
+        """Return the fastest usable method at a sigma; None if none is known."""
+        best = one.best
+        if one.cause in ("spread", "nonfinite"):
+            return None
+        if best is not None and best.name != "smoothing" and self.derivative == WRONG:
+            return next((m for m in one.methods if m.name == "smoothing" and math.isfinite(m.seconds)), None)
+        return best
 
     # ----------------------------------------------------------------------------------------------------- both
 
@@ -784,45 +211,11 @@ class Findings:
         parts = parts if self.check.cause in FAULTS else list(self.check.components)
         return max((part.error for part in parts if math.isfinite(part.error)), default=math.nan)
 
-    @property
-    def unit(self) -> float:
-        """The unit roundoff of the cost's arithmetic."""
-        return 2.0**-7 if self.precision == "bfloat16" else float(np.finfo(self.precision).eps)
-
-    @property
-    def resolved_parts(self) -> list[Part]:
-        """The components whose differences have at least one correct digit."""
-        return [p for p in self.named.components if p.uncertainty < DIGIT * abs(p.difference)]
-
-    @property
-    def resolution(self) -> float:
-        """The smallest relative error that these differences detect."""
-        errors = [CHANCE * p.uncertainty / abs(p.difference) for p in self.resolved_parts]
-        return max([resolution(self.unit), *errors])
-
-    def recommended(self, one: Smoothed) -> Method | None:
-        """Return the fastest usable method at a sigma; None if none is known."""
-        best = one.best
-        if one.cause in ("spread", "nonfinite"):
-            return None
-        if best is not None and best.name != "smoothing" and self.derivative == WRONG:
-            return next((m for m in one.methods if m.name == "smoothing" and math.isfinite(m.seconds)), None)
-        return best
-
-    @property
-    def theta(self) -> np.ndarray:
-        """The vector ``(d,)``."""
-        return self.layout.vector
+    # --------------------------------------------------------------------------------------------------- tables
 
     @property
     def _shown(self) -> range:
         return range(min(self.theta.size, SHOWN))
-
-    def label(self, part: Part) -> str:
-        """Return a part's name: the name of its component of theta, or the name of its direction, ``direction 0``."""
-        return part.name if part.component is None else self.layout.name(part.component)
-
-    # --------------------------------------------------------------------------------------------------- tables
 
     def derivative_rows(self) -> list[dict[str, Any]]:
         """Return a row per checked derivative: the program's value, the difference, and the verdict."""

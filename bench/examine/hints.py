@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -41,45 +40,36 @@ def hint_of(check: Check, theta: np.ndarray, explained: Explanation) -> Hint | N
     at, program, difference = np.array([[theta[p.component or 0], p.program, p.difference] for p in parts]).T
     if not np.isfinite(program).all():
         return None
-    rows = _explanations(at, program, difference, wrong, len(parts) == theta.size, explained)
-    return next((Hint(cause, text) for cause, holds, text in rows if holds), None)
-
-
-def _explanations(
-    at: np.ndarray,
-    program: np.ndarray,
-    difference: np.ndarray,
-    wrong: np.ndarray,
-    is_whole: bool,
-    explained: Explanation,
-) -> Iterator[tuple[str, bool, str]]:
-    """Yield causes of a wrong gradient ``program (n,)``, whether each fits, and its text, in the order in which they are tried."""
     inputs, ratios, error = at[wrong], (program / difference)[wrong], program - difference
     step, noise, growth = explained.difference_step, explained.gradient_noise, explained.growth
+    is_whole = len(parts) == theta.size
     is_several = is_whole and wrong.sum() > 1
-    yield "wrong_adjoint", bool(step), f"it is a difference of the cost at a step of {step}"
     is_sorted = _are_equal(np.sort(program), np.sort(difference)) and not _are_equal(program, difference)
-    yield "wrong_adjoint", is_several and is_sorted, "its numbers are the differences in another order"
     is_log = np.unique(inputs).size > 1 and _are_equal(ratios, inputs)
-    yield "wrong_adjoint", is_log, "the ratios are the inputs, as of a gradient by their logarithms"
     sizes = float(np.linalg.norm(error) * np.linalg.norm(at))
     is_along = np.count_nonzero(at) > 1 and sizes > 0 and abs(float(error @ at)) > ALONG_THETA * sizes
-    yield (
-        "missing_term",
-        bool(is_whole and is_along),
-        "the error is along theta itself, as of a normalisation that is left out",
-    )
     ends = [f"{number(100 * one.error)}% after {counted(one.steps, 'step')}" for one in (*growth[:1], *growth[1:][-1:])]
     is_short = noise >= SHORT and (np.abs(error[wrong]) <= EXPLAINED * noise * np.linalg.norm(program)).all()
     grown = f", and is off by {' and '.join(ends)}" * (len(ends) > 1)
-    own = f"the gradient has noise of its own, {number(100 * noise, 1)}%, as by a short float{grown}"
-    yield "wrong_adjoint", bool(is_short), own
     errors = [one.error for one in growth]
     is_falling = len(growth) > 1 and errors[0] > FALLS * errors[-1] and errors == sorted(errors, reverse=True)
-    yield "continuous_adjoint", is_falling, f"off by {' and '.join(ends)}"
     size = float(np.linalg.norm(difference))
     is_turned = abs(np.linalg.norm(program) - size) <= ALIKE * size and np.linalg.norm(error) > TURNED * size
-    yield "wrong_adjoint", bool(is_several and is_turned), "its norm is that of the differences, as in another frame"
+    short = f"the gradient has noise of its own, {number(100 * noise, 1)}%, as by a short float{grown}"
+    rows = [
+        ("wrong_adjoint", step, f"it is a difference of the cost at a step of {step}"),
+        ("wrong_adjoint", is_several and is_sorted, "its numbers are the differences in another order"),
+        ("wrong_adjoint", is_log, "the ratios are the inputs, as of a gradient by their logarithms"),
+        (
+            "missing_term",
+            is_whole and is_along,
+            "the error is along theta itself, as of a normalisation that is left out",
+        ),
+        ("wrong_adjoint", is_short, short),
+        ("continuous_adjoint", is_falling, f"off by {' and '.join(ends)}"),
+        ("wrong_adjoint", is_several and is_turned, "its norm is that of the differences, as in another frame"),
+    ]
+    return next((Hint(cause, text) for cause, holds, text in rows if holds), None)
 
 
 def _are_equal(first: np.ndarray, second: np.ndarray) -> bool:

@@ -8,10 +8,11 @@ level. This search follows each place separately with two costs per halving, sin
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+
+from bench.gradient.direction import Function
 
 POINTS = 97
 """Number of points of a scan. Not a power of 2 plus one, so that points rarely coincide with round numbers."""
@@ -89,7 +90,7 @@ class LineScan:
 
 
 def scan(
-    along: Callable[[np.ndarray], np.ndarray],
+    along: Function,
     direction: np.ndarray,
     noise: float,
     reach: float = REACH,
@@ -126,7 +127,7 @@ def scan(
 
 
 def _locate_breaks(
-    along: Callable[[np.ndarray], np.ndarray],
+    along: Function,
     t: np.ndarray,
     f: np.ndarray,
     places: list[int],
@@ -163,9 +164,7 @@ def _locate_breaks(
     return kept
 
 
-def _confirmed(
-    along: Callable[[np.ndarray], np.ndarray], found: list[tuple[Break, float]], noise: float
-) -> list[Break]:
+def _confirmed(along: Function, found: list[tuple[Break, float]], noise: float) -> list[Break]:
     """Return the breaks on both sides of which the cost is smooth, from four more costs on each side.
 
     A rough cost has second differences of every size, which look like jumps. Beside a jump its values scatter as much as

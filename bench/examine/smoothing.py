@@ -185,7 +185,7 @@ def _summary(
     drawn: np.ndarray,
     plain: np.ndarray | None,
     simulator: Simulator,
-    unseen: Callable[[int], tuple[float, float]] | None = None,
+    unseen: Callable[[int], tuple[float, float]] | None,
 ) -> Smoothed:
     # SciPy's distributions are slow to import, and only this function needs them
     from bench.measure.statistics import Truth, summarise

@@ -21,6 +21,7 @@ from bench.examine.few import ROUNDS, FewSteps, is_nothing
 from bench.examine.subspace import Group, Subspace, choose, count_of, in_parts, locate
 from bench.gradient import EPS, FAULTS, TRUSTED, Check, Options, Part, check, step_sizes
 from bench.gradient.check import ELSEWHERE, NOTHING, cause_of
+from bench.gradient.direction import Function
 from bench.simulator.clock import OutOfTime
 from bench.simulator.simulator import Simulator
 
@@ -28,8 +29,8 @@ NOISE_POINTS = 17
 """Costs per direction that no step needs: the centre, and the points at which the noise is measured."""
 SCAN = 7 * 65
 """Number of costs of a staircase search along one direction that is not clearly right."""
-ALL_STEPS, FEW, MOST = "all steps and random directions", 2, 8
-"""Name of a later stage, and numbers of other thetas of the last ones."""
+FEW, MOST = 2, 8
+"""Numbers of other thetas of the last stages."""
 SMALL = 0.6
 """Power of the unit roundoff: a relative difference between equal calls below it is a floor, not a fault."""
 MANY = 10_000
@@ -48,6 +49,8 @@ BEFORE_NOISE = 0.4
 """Largest share of the last stage on a gradient that looks right, where noise is measured after it."""
 STATE = 0.1
 """Largest share of the difference between histories by which a cost with equal histories differs."""
+CALLS, CALLS_OF_STATE = 8, 26
+"""Equal calls of a cost, and those that show a state: noise of two values looks like one in 8 calls once in 8, in 26 once in 30,000."""
 
 
 @dataclass
@@ -124,25 +127,12 @@ class GradientStages:
 
     def costs_along(self, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Return the costs ``(n,)`` at theta + t * direction for t of n numbers."""
-        return self._along(self.costs, direction, t)
+        return self.along(self.costs, direction, t)
 
-    def slopes_along(self, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Return the program's derivatives ``(n,)`` along a direction at theta + t * direction for t of n numbers."""
-        return self._along(lambda thetas: direction @ self.gradients(thetas), direction, t)
-
-    def _along(self, function: Callable[[np.ndarray], np.ndarray], direction: np.ndarray, t: np.ndarray) -> np.ndarray:
-        def at(part: np.ndarray) -> np.ndarray:
-            return function(self.theta[:, None] + direction[:, None] * part)
-
-        return in_parts(at, t.ravel(), self.simulator.width)
-
-    def differences(
-        self, theta: np.ndarray, vectors: np.ndarray, step: float, simulator: Simulator | None = None
-    ) -> np.ndarray:
-        """Return central differences ``(m,)`` at ``theta (d,)`` along ``vectors (d, m)``, of the cost or of another simulator."""
-        thetas = theta[:, None] + step * np.concatenate([vectors, -vectors], axis=1)
-        costs = self.costs(thetas, simulator=simulator)
-        return np.asarray(np.subtract(*np.split(costs, 2)) / (2.0 * step))
+    def along(self, function: Function, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Return a function of columns, ``(n,)``, at theta + t * direction for t of n numbers."""
+        theta, vector = self.theta[:, None], direction[:, None]
+        return in_parts(lambda part: function(theta + vector * part), t.ravel(), self.simulator.width)
 
     def gradients(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
         """Return the simulator's gradients at ``thetas (d, B)``, all under the same draw of its own noise."""
@@ -177,18 +167,8 @@ class GradientStages:
         if self.left_out:
             return
         self.repeat_failures()
-        if not self.is_failed:
-            self._run_stages(explain)
-
-    def repeat_failures(self) -> None:
-        """Repeat calls that raised an exception, which may do so at random; the repeats do not count as further exceptions."""
-        counts = deepcopy(self.simulator.raised)
-        with self.clock.stage("calls that raised an exception, once more", self.left_out):
-            for kind, *parts in list(self.simulator.failed):
-                self.repeats.is_failing |= bool(np.isfinite(getattr(self.simulator, kind)(*parts)).any())
-        self.simulator.raised = counts
-
-    def _run_stages(self, explain: Callable[[Check], None]) -> None:
+        if self.is_failed:
+            return
         space = choose(self.layout, self.scale, self.gradient, self.seed)
         self.groups = {group.name: group for group in space.groups}
         with self.clock.stage("the check at more than one step", self.left_out):
@@ -201,7 +181,15 @@ class GradientStages:
             return
         self._check_in_stages(space, explain)
         self._locate(space)
-        self._check_under_other_noise()
+        self._check_under_other_noise(space)
+
+    def repeat_failures(self) -> None:
+        """Repeat calls that raised an exception, which may do so at random; the repeats do not count as further exceptions."""
+        counts = deepcopy(self.simulator.raised)
+        with self.clock.stage("calls that raised an exception, once more", self.left_out):
+            for kind, *parts in list(self.simulator.failed):
+                self.repeats.is_failing |= bool(np.isfinite(getattr(self.simulator, kind)(*parts)).any())
+        self.simulator.raised = counts
 
     def _start(self) -> None:
         """Compute the cost at theta, once more, and the gradient."""
@@ -234,22 +222,28 @@ class GradientStages:
     def _repeat(self) -> None:
         """Repeat calls, after equal and after other thetas, and compare the results."""
         other, values = self.theta + 1e-3 * self.scale, [self.value]
-        is_other = (False, False, True, False, False, True, False, False)  # the first call was made before
         with self.clock.stage("repeating a call", self.left_out):
-            for each in is_other[1:]:
-                values.append(float(self.costs((other if each else self.theta)[:, None])[0]))
+            while len(values) < CALLS or (len(values) < CALLS_OF_STATE and self._compare_calls(values)):
+                at = other if len(values) % 3 == 2 else self.theta
+                values.append(float(self.costs(at[:, None])[0]))
         self._repeat_gradient(other)
-        for each in (False, True):
-            same = [value for value, one in zip(values, is_other, strict=False) if one == each]
+        self._repeated = len(values) >= CALLS
+        self.repeats.has_state = self._compare_calls(values) and len(values) == CALLS_OF_STATE
+
+    def _compare_calls(self, values: list[float]) -> bool:
+        """Record how far equal calls differ, and return whether they differ by the call before them alone, each time by as much.
+
+        Every third call is at another theta.
+        """
+        for same in (values[2::3], [*values[::3], *values[1::3]]):
             if len(same) > 1 and np.isfinite(same).all():
                 self.repeats.spread = max(self.repeats.spread, float(np.ptp(same)))
-        self._repeated = len(values) == len(is_other)
-        if (
-            self._repeated and self.repeats.spread > self.repeats.floor
-        ):  # last digits that vary at random are alike by chance
-            after_theta, after_other = values[4::3], values[3::3]
-            apart = STATE * abs(after_theta[-1] - after_other[-1])
-            self.repeats.has_state = bool(max(np.ptp(after_theta), np.ptp(after_other)) <= apart)
+        # last digits that vary at random are alike by chance
+        if len(values) < CALLS or self.repeats.spread <= self.repeats.floor:
+            return False
+        after_theta, after_other = values[4::3], values[3::3]
+        apart = STATE * abs(after_theta[-1] - after_other[-1])
+        return bool(max(np.ptp(after_theta), np.ptp(after_other)) <= apart)
 
     def _repeat_gradient(self, other: np.ndarray) -> None:
         """Compare the gradient with that of an equal call after one at ``other (d,)``, or in a batch with it."""
@@ -282,12 +276,12 @@ class GradientStages:
         def costs(*units: float) -> np.ndarray:
             return self.costs(first[:, None] + ulp[:, None] * np.array(units))
 
-        if not _are_equal(costs(0.0, IN_CELL)):
+        if np.ptp(costs(0.0, IN_CELL)):
             return False
         cells = costs(*range(CELLS))
         inside = costs(-IN_CELL, CELLS // 2 - IN_CELL, CELLS // 2 + IN_CELL)
-        is_constant = _are_equal(np.r_[cells[0], inside[0]]) and _are_equal(np.r_[cells[CELLS // 2], inside[1:]])
-        return is_constant and np.unique(cells).size >= DISTINCT_CELLS
+        is_constant = cells[0] == inside[0] and cells[CELLS // 2] == inside[1] == inside[2]
+        return bool(is_constant and np.unique(cells).size >= DISTINCT_CELLS)
 
     def _options(self, size: int, draws: int = -1) -> Options:
         """Return the options of the last stage with a number of other thetas, or by default those of more steps."""
@@ -338,7 +332,7 @@ class GradientStages:
             ]  # named by few thetas first, so that the name does not depend on the time that is left
         for count in draws:
             share = BEFORE_NOISE if self._has_noise and self.check.trusted else MOST_OF_IT
-            name = f"{count} other thetas" if count else ALL_STEPS
+            name = f"{count} other thetas" if count else "all steps and random directions"
             is_done = self._run_stage(name, space, self._options(space.size, count), share)
             if is_done != is_wrong:
                 break
@@ -398,11 +392,10 @@ class GradientStages:
             added = replace(outcome.parts[0], verdict=verdict, name=f"number {index}")
             self.check = replace(self.check, parts=(added, *self.check.parts))
 
-    def _check_under_other_noise(self) -> None:
+    def _check_under_other_noise(self, space: Subspace) -> None:
         """Check the gradient along random directions under other draws of the simulator's own noise."""
         if self.w is None or not self.check.trusted or self.is_quick:
             return
-        space = choose(self.layout, self.scale, self.gradient, self.seed)
         options = replace(self._options(space.size, 0), components=0, scanned=0, repeated=False)
         with self.clock.stage("checks under other noise", self.left_out):
             if not self.clock.can_afford(*self._cost_of(options, 0), share=SHARE):
@@ -410,10 +403,6 @@ class GradientStages:
             for _ in range(OTHER_NOISE):
                 w = self._random.standard_normal((self.simulator.noise, 1))
                 self.more.append(space.restore(self._check_once(space, options, w)))
-
-
-def _are_equal(values: np.ndarray) -> bool:
-    return bool(np.isfinite(values).all() and (values == values[0]).all())
 
 
 def _with_zeros(outcome: Check) -> Check:

@@ -9,12 +9,12 @@ few thetas.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bench.gradient.check import Check, Part, extremes
+from bench.gradient.direction import Function
 from bench.simulator.tree import ParameterTree
 
 MOST = 16
@@ -77,7 +77,7 @@ class Subspace:
         return replace(part, component=None, name=self.groups[part.component - len(self.components)].name)
 
 
-def in_parts(function: Callable[[np.ndarray], np.ndarray], z: np.ndarray, width: int) -> np.ndarray:
+def in_parts(function: Function, z: np.ndarray, width: int) -> np.ndarray:
     """Return ``function(z)``, ``(B,)``, for ``z (..., B)``, ``width`` columns at a time, since memory holds few large thetas."""
     parts = (z[..., first : first + width] for first in range(0, max(z.shape[-1], 1), width))
     return np.concatenate([function(part) for part in parts])
@@ -117,9 +117,7 @@ def groups_of(layout: ParameterTree, scale: np.ndarray, seed: int) -> list[Group
     return groups
 
 
-def locate(
-    group: Group, theta: np.ndarray, gradient: np.ndarray, cost: Callable[[np.ndarray], np.ndarray], part: Part
-) -> tuple[int, int]:
+def locate(group: Group, theta: np.ndarray, gradient: np.ndarray, cost: Function, part: Part) -> tuple[int, int]:
     """Return the first and the last number + 1 of a group that cause the error of its slope, ``part``, by halving.
 
     Each halving takes two costs. The search ends at one number, at the uncertainty of the slope, or where both halves have a

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.examine.findings import FAILED, NONE, RIGHT, SEEN, Findings, as_text, shortened
+from bench.examine.facts import SEEN, as_text, shortened
+from bench.examine.findings import FAILED, NONE, RIGHT, Findings
 from bench.examine.lines import REACH
 from bench.examine.smoothing import PAIRS, TARGET_ERROR
 from bench.gradient import FAULTS
@@ -120,7 +121,7 @@ def warnings(report: Findings) -> list[str]:
             f"{limit}: errors below about {number(100 * report.resolution, 1)}% are not seen": holds
             for limit, holds in limits.items()
         },
-        f"the gradient raised an exception {report.n_failed} times away from theta: {shortened(report.error)}": report.n_failed
+        f"the gradient raised an exception {report.n_failed} times away from theta: {report.error_text}": report.n_failed
         and not report.is_failed,
         f"the cost is not a number or raises an exception, {report.place}": report.derivative_cause != "nonfinite"
         and report.place,
@@ -215,7 +216,7 @@ def write(report: Findings) -> str:
             f"With noise of sigma {unit}, J = E cost; samples, calls and seconds are for an error of 10%:",
             report.sigma_rows(),
         ),
-        ["The gradient's exception:", f"  {error}"] if len(error) > len(shortened(error)) else [],
+        ["The gradient's exception:", f"  {error}"] if len(error) > len(report.error_text) else [],
     ]
     return "\n\n".join("\n".join(filter(None, part)) for part in parts if part)
 

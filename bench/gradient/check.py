@@ -12,14 +12,10 @@ import numpy as np
 
 from . import roughness
 from .causes import Ratio, causes_of_ratios
-from .direction import EPS, FINE, GUARD, Finding, Sample, judge
+from .direction import EPS, FINE, GUARD, Finding, Function, Sample, judge
 from .rules import FAULTS, RULES, TRUSTED, UNEQUAL, VERDICTS
-from .sampling import Modes, order, repeats, sampled
+from .sampling import Modes, repeats, sampled
 
-Cost = Callable[[np.ndarray], np.ndarray]
-"""Costs of columns: ``(d, B)`` to ``(B,)``."""
-Gradient = Callable[[np.ndarray], np.ndarray]
-"""The gradient at one theta: ``(d,)`` to ``(d,)``."""
 Tangent = Callable[[np.ndarray, np.ndarray], float]
 """A derivative at a theta along a direction, both ``(d,)``, from the cost's code but not from its gradient; NaN if unknown."""
 AGREES = 1e-3
@@ -88,8 +84,20 @@ class Part(Finding):
 
     @property
     def order(self) -> float:
-        """Order of the Taylor remainder: 2 for a right gradient, 1 for a wrong one, NaN where the remainder is only noise."""
-        return order(self.sample)
+        """Order in h of the Taylor remainder |f(x + h d) - f(x) - h g d|: 2 for a right gradient, 1 for a wrong one.
+
+        The order is the median slope, in log scales, over the five smallest steps on either side whose remainder exceeds
+        ten times the noise. It is NaN with fewer than four such steps, as for a linear cost. No choice of a best step is
+        needed.
+        """
+        sample, slopes = self.sample, []
+        for side, sign in ((sample.plus, 1.0), (sample.minus, -1.0)):
+            with np.errstate(all="ignore"):
+                rest = np.abs(side - sample.centre - sign * sample.step * sample.derivative)
+                clear = np.flatnonzero(np.isfinite(rest) & (rest > 10.0 * sample.uncertainty * sample.step))[-5:]
+            if clear.size >= 4:
+                slopes += list(np.diff(np.log(rest[clear])) / np.diff(np.log(sample.step[clear])))
+        return float(np.median(slopes)) if slopes else float("nan")
 
     @property
     def ratio(self) -> float:
@@ -201,8 +209,8 @@ def scales(theta: np.ndarray) -> np.ndarray:
 
 
 def check(
-    cost: Cost,
-    gradient: Gradient | None,
+    cost: Function,
+    gradient: Function | None,
     theta: np.ndarray,
     options: Options | None = None,
     modes: Modes | None = None,
@@ -230,7 +238,7 @@ def extremes(weights: np.ndarray, most: int) -> list[int]:
 
 
 def settle(
-    cost: Cost, theta: np.ndarray, vector: np.ndarray, length: float, sample: Sample, tangent: Tangent | None
+    cost: Function, theta: np.ndarray, vector: np.ndarray, length: float, sample: Sample, tangent: Tangent | None
 ) -> Finding | None:
     """Return the finding on an unsettled direction from smaller steps or from the tangent; None if it stays unsettled."""
     length_, derivative, doubt, moved = np.array([[length], [sample.derivative], [sample.doubt], [sample.moved]])
@@ -267,8 +275,8 @@ class _Line:
 class _Checker:
     """One check: what is given, the random numbers, and what was measured of a loose solver."""
 
-    _cost: Cost
-    _gradient: Gradient | None
+    _cost: Function
+    _gradient: Function | None
     theta: np.ndarray
     options: Options
     _modes: Modes | None

@@ -9,10 +9,13 @@ derivative.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+Function = Callable[[np.ndarray], np.ndarray]
+"""Of arrays: costs ``(B,)`` of columns ``(d, B)``, a gradient ``(d,)`` at a theta ``(d,)``, or costs ``(n,)`` at n places on a line."""
 EPS = np.logspace(-2, -10, 17)
 """Step sizes, two per decade, in units of the natural scale."""
 SINGLE_EPS = np.logspace(-1, -7, 13)
@@ -187,7 +190,7 @@ def _judge(sample: Sample) -> Finding:
     index, spread = plateau(sample, noise)
     uncertainty = spread + float(noise[index])
     doubt = sample.doubt + min(sample.moved, max(_change_of_slope(sample, noise, index), LARGEST * sample.size(index)))
-    tolerance = CHANCE * spread + float(noise[index]) + _resolution(sample, index) + doubt
+    tolerance = CHANCE * spread + float(noise[index]) + resolution(sample.unit) * sample.size(index) + doubt
     apart = abs(float(sample.differences[index]) - sample.derivative)
     alike, rounding = ALIKE * sample.size(index), GUARD * float(sample.rounding(sample.unit)[index])
     resolved = uncertainty <= max(alike, rounding)
@@ -298,10 +301,6 @@ def resolution(unit: float) -> float:
     return min(float(np.cbrt(unit)), LARGEST)
 
 
-def _resolution(sample: Sample, index: int) -> float:
-    return resolution(sample.unit) * sample.size(index)
-
-
 def wrong(sample: Sample) -> str:
     """Return the verdict on a derivative that is not the difference."""
     return "disconnected" if sample.derivative == 0.0 else "wrong_adjoint"
@@ -312,10 +311,10 @@ def _is_between_slopes(sample: Sample, noise: np.ndarray) -> bool:
 
     The tolerance of a slope is its change from the previous step, which exceeds the slope's error of order h.
     """
-    resolved = [i for i in range(1, noise.size) if noise[i] <= _resolution(sample, i)]
+    resolved = [i for i in range(1, noise.size) if noise[i] <= resolution(sample.unit) * sample.size(i)]
     finest = resolved[-1] if resolved else int(np.argmin(noise[1:])) + 1
     slopes = [(side[finest], abs(side[finest] - side[finest - 1])) for side in (sample.left, sample.right)]
-    tolerance = noise[finest] + _resolution(sample, finest)
+    tolerance = noise[finest] + resolution(sample.unit) * sample.size(finest)
     low = min(slope - change for slope, change in slopes) - tolerance
     high = max(slope + change for slope, change in slopes) + tolerance
     return bool(low <= sample.derivative <= high)

@@ -56,8 +56,8 @@ DERIVATIVE = {
         "the cost is constant between steps of its input: a cast to int, a rounding, a comparison",
         "of {roughness.SCAN} costs in a row, {roughness.EDGES} or more isolated changes exceed all others {roughness.APART:g} times "
         "and make up {check.SHARE:.0%} of the gradient's error, and the gradient is not the slope over them. Around theta: lines are flat between jumps, or the gradient misses "
-        "{findings.SEEN:.0%} of the cost's change in jumps of one height at even distances; or the differences at the "
-        "{direction.MIN_STEPS} smallest steps are 0 beside jumps, and wider ones are not, or the gradient is below {findings.RESIDUE:g} of a jump",
+        "{facts.SEEN:.0%} of the cost's change in jumps of one height at even distances; or the differences at the "
+        "{direction.MIN_STEPS} smallest steps are 0 beside jumps, and wider ones are not, or the gradient is below {facts.RESIDUE:g} of a jump",
         f"{SMOOTHING}, or remove the rounding",
     ),
     "precision": Rule(
@@ -157,7 +157,7 @@ DERIVATIVE = {
     ),
     "rounding": Rule(
         "right",
-        "small steps have larger errors than the arithmetic explains, as with a loose solver tolerance",
+        "small steps have larger errors than the arithmetic explains, as with a loose solver tolerance or a gradient that is a long difference",
         "three smaller steps have errors above {direction.NOISY:g} times rounding, or the derivative is off by less than "
         "{check.LOOSE:.1%} of the largest and {check.EXPLAINED:g} times the jumps of a solver that stops early",
         "",
@@ -200,7 +200,7 @@ EXAMINATION = {
     "rough": Rule(
         "fault",
         "the cost changes as much between neighbouring thetas as over a wide step",
-        "`unsettled`, and neighbours by {findings.ROUGH:.0%} of the largest change, which the gradient does not explain",
+        "`unsettled`, and neighbours by {facts.ROUGH:.0%} of the largest change, which the gradient does not explain",
         "look for a seed or hash taken from theta",
     ),
     "overwritten": Rule(
@@ -234,8 +234,8 @@ EXAMINATION = {
     "noisy": Rule(
         "open",
         "the cost draws noise of its own, which hides the slope",
-        "the spread of equal calls of the cost is above u^{stages.SMALL} of it and does not come from the call before, and nothing else is wrong; or the gradient has "
-        "noise too, and no difference is {findings.CONTRADICTED:g} errors, with those by noise, away from it",
+        "the spread of equal calls of the cost is above u^{stages.SMALL} of it and does not come from the call before, in {stages.CALLS_OF_STATE} calls, and nothing else is wrong; or the gradient has "
+        "noise too, and no difference is {facts.CONTRADICTED:g} errors, with those by noise, away from it",
         "fix the seed, or pass the noise as w and set noise=N",
         EXPECTED,
     ),
@@ -256,23 +256,23 @@ EXAMINATION = {
     "unresolved": Rule(
         "open",
         "rounding or noise of the cost hides its slope at every step, or contradicts a small derivative",
-        "right, but the error of the difference is above {findings.RESOLVED:.0%} of it, of derivatives that matter, or above {findings.DIGIT:.0%}, of inputs below {findings.TINY:g}; or both are {findings.CONTRADICTED:g} errors and "
-        "{findings.DIGIT:.0%} apart; or not 0 and below {findings.PART:.0%} of a difference that is below about {findings.SLIGHT:g} of the largest right derivative",
+        "right, but the error of the difference is above {facts.RESOLVED:.0%} of it, of derivatives that matter, or above {facts.DIGIT:.0%}, of inputs below {facts.TINY:g}; or both are {facts.CONTRADICTED:g} errors and "
+        "{facts.DIGIT:.0%} apart; or not 0 and below {facts.PART:.0%} of a difference that is below about {facts.SLIGHT:g} of the largest right derivative",
     ),
     "adaptive": Rule(
         "open",
         "gradient and differences differ by as much as the discretisation does, as with adaptive steps: neither is "
         "exactly the derivative of the solution",
         "`missing_term` or `wrong_adjoint` where a loop's length depends on theta, and the error is at most {diagnosis.EXPLAINED:g} times "
-        "the jumps and kinks of a line, as slopes over its length; or {diagnosis.EXPLAINED_IF_SMALL:g} times, or there are fewer than "
-        "{diagnosis.FEWEST_BREAKS}, where it and that of each wrong component are at most {diagnosis.NEAR:.0%}; lines whose jumps are above {diagnosis.MOST_OF_CHANGE:.0%} of the change do not count. With `refined`: the gradient is at "
-        "most {findings.AGREES:g} times as far from it as the differences at each theta, or {findings.AS_FAR:g} times beside such a loop. "
+        "the slope of {diagnosis.FEWEST_BREAKS} or more jumps, over the length of a line, and kinks; or {diagnosis.EXPLAINED_IF_SMALL:g} times, or there are fewer "
+        "breaks, where it and that of each wrong component are at most {diagnosis.NEAR:.0%}; jumps above {diagnosis.MOST_OF_CHANGE:.0%} of the cost's change on their line are events and do not count. With `refined`: the gradient is at "
+        "most {facts.AGREES:g} times as far from it as the differences at each theta, or {facts.AS_FAR:g} times beside such a loop. "
         "Of a rough cost: no slope over wide steps is known to {smooth_part.LIMIT:.0%}",
         "give the cost at a tighter tolerance; accept it if the gradient is meant to be that one's",
         ("refined=COST", *EXPECTED),
     ),
 }
-"""Verdicts from all facts that ``examine`` has at theta, instead of the worst on a derivative."""
+"""Verdicts from all facts that ``examine`` has at theta, in the order of :mod:`bench.examine.verdicts`, instead of the worst on a derivative."""
 NOISE = {
     "jumps": Rule(
         "broken",

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .direction import EPS, Sample
+from .direction import EPS, Function, Sample
 from .roughness import POINTS, noise, offsets, scatter
 
 Modes = Callable[[np.ndarray], Sequence[str]]
@@ -25,7 +25,7 @@ def repeats(first: np.ndarray, second: np.ndarray, unit: float) -> np.ndarray:
 
 
 def sampled(
-    cost: Callable[[np.ndarray], np.ndarray],
+    cost: Function,
     theta: np.ndarray,
     vectors: np.ndarray,
     lengths: np.ndarray,
@@ -73,20 +73,3 @@ def sampled(
             )
             result.append(replace(sample, noise=max(measured, scatter(sample.step, sample.differences))))
     return result, minus_modes, plus_modes
-
-
-def order(sample: Sample) -> float:
-    """Return the order in h of the Taylor remainder |f(x + h d) - f(x) - h g d|: 2 for a right gradient, 1 if wrong.
-
-    The order is the median slope, in log scales, over the five smallest steps on either side whose remainder exceeds
-    ten times the noise. It is NaN with fewer than four such steps, as for a linear cost. No choice of a best step is
-    needed.
-    """
-    slopes: list[float] = []
-    for side, sign in ((sample.plus, 1.0), (sample.minus, -1.0)):
-        with np.errstate(all="ignore"):
-            rest = np.abs(side - sample.centre - sign * sample.step * sample.derivative)
-            clear = np.flatnonzero(np.isfinite(rest) & (rest > 10.0 * sample.uncertainty * sample.step))[-5:]
-        if clear.size >= 4:
-            slopes += list(np.diff(np.log(rest[clear])) / np.diff(np.log(sample.step[clear])))
-    return float(np.median(slopes)) if slopes else float("nan")

@@ -8,10 +8,11 @@ among the scales where the scatter has reached a tenth of its largest value is t
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+
+from .direction import Function
 
 SCALES = np.logspace(-1, -9, 17)
 """Scales, two per decade, in units of the input's scale."""
@@ -45,9 +46,7 @@ class SmoothPart(NamedTuple):
     """Its standard error, and its change from the next wider scale."""
 
 
-def smooth_part(
-    along: Callable[[np.ndarray], np.ndarray], scale: float, unit: float, random: np.random.Generator
-) -> SmoothPart | None:
+def smooth_part(along: Function, scale: float, unit: float, random: np.random.Generator) -> SmoothPart | None:
     """Return the slope of the smooth part of ``along(t)``, ``(n,)`` to ``(n,)``; None for a cost that is not rough.
 
     A cost that repeats exactly at tiny steps is a staircase and not rough: it has no smooth part that the program knows.

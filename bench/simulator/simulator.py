@@ -54,6 +54,11 @@ def accepts(function: Callable[..., Any], *arguments: Any, **settings: Any) -> b
     return False
 
 
+def unit_of(dtype: str) -> float:
+    """Return the unit roundoff of a floating-point type by its name."""
+    return 2.0**-7 if dtype == "bfloat16" else float(np.finfo(dtype).eps)
+
+
 class Simulator:
     """A cost f(theta) or f(theta, w) and optionally its gradient, on NumPy batches with one sample per column.
 
@@ -73,9 +78,10 @@ class Simulator:
         clock: Clock | None = None,
         library: str = "",
         compiles: bool = True,
+        name: str = "the cost",
     ) -> None:
         if not callable(cost):
-            raise UserError(f"the cost is a function of theta, not {type(cost).__name__}")
+            raise UserError(f"{name} is a function of theta, not {type(cost).__name__}")
         batch, self.fixed = _parse_batch(batch)
         if not (grad is None or callable(grad) or str(grad) in LIBRARIES):
             raise unknown("grad", grad, (*LIBRARIES, "a function of theta"))
@@ -99,7 +105,8 @@ class Simulator:
         """What cost and gradient print."""
         self.first_value = float("nan")
         """The cost at theta, from the first call, with w = 0."""
-        self._cost = self._guarded(cost, "the cost")
+        self._name = name
+        self._cost = self._guarded(cost, name)
         self._grad = self._guarded(grad, "the gradient") if callable(grad) else grad
         self._shapes: set[Any] = set()
         self._compiled: dict[str, tuple[Any, ...]] = {}
@@ -120,9 +127,12 @@ class Simulator:
             try:
                 with redirect_stdout(self.printed), redirect_stderr(self.printed):
                     value = function(theta, *arguments, **settings)
-                if value is None or (isinstance(value, tuple) and name == "the cost"):
-                    what = "None, as without a return statement" if value is None else "a tuple, not one number"
-                    raise UserError(f"{name} returned {what}")
+                if isinstance(value, tuple) and name == self._name:
+                    if len(value) != 1:
+                        raise UserError(f"{name} returned a tuple of {len(value)} values, not one number")
+                    (value,) = value
+                if value is None:
+                    raise UserError(f"{name} returned None, as without a return statement")
                 return value
             except TypeError as error:
                 if accepts(function, theta, *arguments, **settings):
@@ -136,9 +146,9 @@ class Simulator:
 
     # ------------------------------------------------------------------------------------------- other calls
 
-    def variant(self, cost: Callable[..., Any], grad: Any = None) -> Simulator:
+    def variant(self, cost: Callable[..., Any], grad: Any = None, name: str = "the cost") -> Simulator:
         """Return the simulator of another cost and gradient that are called as these, on the same clock."""
-        return Simulator(cost, self.layout, grad, self.noise, self.mode, self.clock, self.library)
+        return Simulator(cost, self.layout, grad, self.noise, self.mode, self.clock, self.library, name=name)
 
     def with_steps(self, steps: int) -> Simulator:
         """Return the simulator of the same cost and gradient after another number of steps."""
@@ -172,8 +182,7 @@ class Simulator:
     @property
     def unit(self) -> float:
         """Unit roundoff of the least precise floating-point type between theta and the cost."""
-        types = {self.precision, *(leaf.dtype for leaf in self.layout.leaves)}
-        return max(float(np.finfo(name).eps) if name != "bfloat16" else 2.0**-7 for name in types)
+        return max(map(unit_of, [self.precision, *(leaf.dtype for leaf in self.layout.leaves)]))
 
     @property
     def width(self) -> int:
@@ -286,7 +295,7 @@ class Simulator:
         """Return the cost's batching mode, detected by trial calls."""
         if batch in ("columns", "rows"):
             if not self._accepts(batch):
-                raise UserError(f"the cost does not accept batch={batch}: {self._batch_error}")
+                raise UserError(f"{self._name} does not accept batch={batch}: {self._batch_error}")
             return batch
         advice = "It must accept theta and return one number"
         try:
@@ -307,7 +316,7 @@ class Simulator:
             if self.layout.flat and self._accepts(layout):
                 self.notes.append(f"the cost takes batches as {layout}")
                 return layout
-        raise UserError(f"the cost cannot be called at theta: {problem}. {advice}")
+        raise UserError(f"{self._name} cannot be called at theta: {problem}. {advice}")
 
     def _repeated(self, count: int) -> list[np.ndarray]:
         """Return ``count`` columns of theta and, if the cost has noise of its own, of noise 0."""
@@ -337,7 +346,7 @@ class Simulator:
         if cost.dtype.kind == "f" or str(cost.dtype) == "bfloat16":
             self.precision = str(cost.dtype)
         elif cost.dtype.kind not in "iub":
-            raise UserError(f"the cost is of type {cost.dtype}: it must be one real number")
+            raise UserError(f"{self._name} is of type {cost.dtype}: it must be one real number")
         self.first_value = float(cost.ravel()[0])
 
     def _detect_vmap(self, batch: str | None) -> str:

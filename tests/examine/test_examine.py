@@ -269,12 +269,18 @@ def test_batches_are_told_from_the_result():
         ({"grad": lambda x, y: x}, r"the gradient must accept \(theta\): .* missing"),
         ({"noise": 3}, r"the cost must accept \(theta, w\): "),
         ({"horizons": [1, 2]}, r"the cost must accept \(theta, steps\): "),
-        ({"cost": lambda x: (1.0, {})}, "the cost returned a tuple"),
+        ({"cost": lambda x: (1.0, {})}, "the cost returned a tuple of 2 values"),
+        ({"grad": lambda x: 3 * x, "refined": lambda x, rtol: 1.0}, r"refined must accept \(theta\): .* missing"),
+        ({"grad": lambda x: 3 * x, "refined": lambda x: x}, "refined cannot be called at theta: it returned an array"),
     ],
 )
 def test_bad_settings_say_what_is_allowed(settings, match):
     with pytest.raises(UserError, match=match):
         examine(**{"cost": bowl, "theta": [1.0, 0.5]} | settings)
+
+
+def test_a_tuple_of_one_number_is_a_cost():
+    assert examine(lambda x: (x @ x,), [1.0, 0.5], grad="jax", calls=500).status == 0
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import simulators
 import bench
 from bench.errors import UserError
 from bench.examine import lines
-from bench.examine.findings import GroupSize
+from bench.examine.facts import GroupSize
 from bench.examine.steps import changing_loop
 from bench.examine.subspace import groups_of
 from bench.report.text import number
@@ -77,16 +77,18 @@ def test_a_small_jump_on_a_curved_line_is_found():
 # ------------------------------------------------------------------------------------- noise and precision
 
 
-def test_last_digits_that_vary_are_never_a_state():
-    for seed in range(8):
+@pytest.mark.parametrize(("size", "values", "causes"), [(1e-16, 3, ["smooth"]), (1e-3, 2, ["noisy", "smooth"])])
+def test_noise_is_never_a_state(size, values, causes):
+    """Two pairs of equal calls are often alike: of two values once in 8."""
+    for seed in range(40):
         random = np.random.default_rng(seed)
 
         def cost(x, random=random):
-            value = swing(x)
-            return np.nextafter(value, value + random.integers(-1, 2))
+            return swing(x) + size * random.integers(values)
 
-        report = examine(cost, START, grad=slope, calls=30)
-        assert (report.status, report.repeats.has_state) == (0, False), seed
+        report = examine(cost, START, grad=slope, calls=60)
+        assert report.cause in causes, seed
+        assert not report.repeats.has_state, seed
 
 
 @pytest.mark.parametrize(
