@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,9 +24,6 @@ from bench.gradient.smooth_part import CLEAR, LIMIT
 from bench.report.text import counted, number, span
 from bench.simulator.simulator import unit_of
 from bench.simulator.tree import ParameterTree
-
-if TYPE_CHECKING:
-    pass
 
 RELATIVE = 0.01
 """Default sigma of the line scans, and of a cost with its own noise, in units of each input's scale."""
