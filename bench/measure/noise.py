@@ -20,8 +20,6 @@ HELD = 1 << 22
 """Most normal numbers that a cell stores in memory (32 MiB). A cell that needs more draws them in parts."""
 KEPT = 4 * HELD
 """Most normal numbers that are kept for cells and references with the same noise."""
-MOST = 1000
-"""Most arrays that are kept: their sizes are summed for each new one."""
 
 _kept: dict[tuple[object, ...], np.ndarray] = {}
 
@@ -40,7 +38,8 @@ def shared(
         block = draw(*given)
         if block.size > HELD:
             return block
-        while len(_kept) >= MOST or sum(kept.size for kept in _kept.values()) > KEPT - block.size:
+        # at most 1000 arrays, since their sizes are summed for each new one
+        while len(_kept) >= 1000 or sum(kept.size for kept in _kept.values()) > KEPT - block.size:
             del _kept[next(iter(_kept))]
     _kept[given] = block
     own = block.copy(order="K")

@@ -151,13 +151,13 @@ def _along(shown: Arranged, axis: Axis) -> Chart | None:
     compares = shown.experiment.compares
     compared = next((column for column in ("backend", "contact") if f"{column}s" in compares), "")
     series = compares.get(f"{compared}s", ())
-    rows = attempted(pd.concat([problem.rows for problem in problems]))
+    rows = attempted(pd.concat(problem.rows for problem in problems))
     labels = (rows[_is_named(rows[compared], series)] if compared else rows)["series"].unique()
     # where the experiment names no estimators, a chart along an axis has the first six
-    names = compares.get("estimators") or [*labels[:6]]
+    names = compares.get("estimators") or labels[:6]
     shares = [f"{len(names)} of {len(labels)} estimators"] * (len(names) < len(labels))
     lines = [_lines(problem, compared, series).set_index("label", drop=False) for problem in drawn]
-    frame = pd.concat([each.loc[[name for name in names if name in each.index]] for each in lines], ignore_index=True)
+    frame = pd.concat((each.loc[[name for name in names if name in each.index]] for each in lines), ignore_index=True)
     notes += ["backends that agree lie on each other"] * (compared == "backend")
     of_steps = frame[frame["horizon"].notna() & (axis.unit == "steps")]
     marks = [Mark(f"beyond the {name}", value, math.inf) for name, value in shown.marks(axis).items()]
