@@ -275,7 +275,7 @@ def _status(rows: pd.DataFrame) -> int:
 
 def _print_written(paths: Sequence[Path]) -> None:
     """Print where the files of a command are: each of a few files, or the folders of many, and the page."""
-    # most files of a command that are listed one by one
+    # three files or fewer are listed one by one
     if len(paths) <= 3:
         print("\nWritten:", *map(printable, paths), sep="\n  ")
         return
@@ -423,9 +423,9 @@ def _gradcheck(words: list[str]) -> int:
     }
     if not _is_given("sweep.horizon", settings):
         sweep = dict(experiment.sweep)
-        # as a setting, or in an identity string
-        is_set = re.compile(r"scene\.\w+\.horizon=|[^=]*\[(.*,)?horizon=|\+?scenes=.*[\[,]horizon=").match
-        if own and not any(map(is_set, words)):
+        choices = [dict(choice.values) for choice in experiment.choices["scene"]]
+        is_set = any("horizon" in values for values in (*choices, *experiment.values.get("scene", {}).values()))
+        if own and not is_set:
             sweep["horizon"] = sorted({*sweep["horizon"], *own})
         else:
             sweep.pop("horizon", None)

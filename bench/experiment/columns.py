@@ -163,7 +163,7 @@ FIRST = (
     text("noise", "what the noise perturbs: `parameter` (theta) or `action`"),
     setting("horizon", "number of time steps T", "steps"),
     setting("dt", "length of a time step", "s"),
-    setting("stiffness", "stiffness of the contact law, or of the scene without one", "N/m"),
+    setting("stiffness", "stiffness of the contact law, or, in the unit of its own, of the scene without one", "N/m"),
     setting("sigma", "standard deviation of the noise in J"),
     setting("smoothing", "smoothing parameter of the contact law: beta, kappa"),
     setting("descent", "share of a descent from theta0 that is done where the gradient is taken", default=0.0),

@@ -433,8 +433,7 @@ def summarise(
     per_sample = tuple(value * samples * unit * unit for value in variance)
     if terms is not None:
         _, low, high = per_sample = variance_per_sample(*terms, samples)
-        # width of the interval of the log variance of terms, times their number, below which it ignores the
-        # error of their mean
+        # only if the mean of the terms were exact could the interval be so narrow
         if low > 0.0 and math.log(high / low) < 10.0 / (repeats * samples):
             notes.append("all terms are equally far from their mean: the interval of their variance is too narrow")
     return Summary(

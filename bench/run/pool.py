@@ -340,7 +340,7 @@ class Pool:
         output = worker.take_output()
         self._remove(worker)
         self._n_failed_starts = 0 if worker.is_ready else self._n_failed_starts + 1
-        # number of consecutive workers killed during their start after which the run ends with an error
+        # the run ends with an error after three workers in a row were killed during their start
         if not worker.is_ready and (self._n_failed_starts == 3 or not was_killed):
             raise UserError(f"a worker cannot start: {reason}; last output: {output or 'none'}")
         rest = worker.queue  # the items behind the failed item have not run
@@ -368,7 +368,7 @@ class Pool:
         if worker.is_done:
             return "done", "a plugin has changed its process"
         now = time.monotonic()
-        # seconds between checks of the items' time and memory
+        # the items' time and memory are checked 20 times a second
         if not worker.fault and now < worker.checked + 0.05:
             return None
         worker.checked, code = now, worker.process.poll()
@@ -382,8 +382,7 @@ class Pool:
         if os.fstat(worker.output.fileno()).st_size > MOST_OUTPUT:
             os.ftruncate(worker.output.fileno(), 0)
         timeout, memory = self._limits.timeout, self._limits.memory
-        # seconds allowed for starting a worker and importing an item's libraries, in addition to the item's
-        # time limit
+        # starting a worker and importing an item's libraries may take 60 s beyond the item's time limit
         if timeout is not None and now - worker.since > timeout + (0 if worker.is_prepared else 60.0):
             return "timeout", f"no result within {timeout:g} s"
         with suppress(psutil.Error):

@@ -8,8 +8,9 @@ import pytest
 from bench.plugins.studies.gradient_check import GradientCheck, is_trusted, measure
 from bench.plugins.studies.gradient_check.views import by_point
 
-from bench import run
+from bench import cli, run
 from bench.cli import main
+from bench.experiment import grid
 from bench.experiment.columns import IDENTITY
 from bench.gradient import FAULTS, TRUSTED, VERDICTS
 from bench.measure import noise
@@ -181,6 +182,22 @@ def test_command_writes_files_and_exits_with_0(tmp_path, capsys):
     assert (table["status"] == "ok").all()
     assert set(table["horizon"]) == {1, 5}
     assert json.loads((directory / "run.json").read_text())["study"] == "gradient_check"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["bounce_once", "scene.bounce_once.horizon=7"],
+        ["bounce_once", "+scene.bounce_once.horizon=7"],
+        ["bounce_once", "scene={bounce_once:{horizon:7}}"],
+        ["bounce_once[horizon=7]"],
+    ],
+)
+def test_a_given_number_of_steps_is_the_only_one(words, monkeypatch):
+    seen = []
+    monkeypatch.setattr(cli, "_execute", lambda experiment, _: seen.append(experiment) or 0)
+    assert main(["gradcheck", *words]) == 0
+    assert {cell.scene.horizon for cell in grid.cells(seen[0])} == {7}
 
 
 def test_contacts_of_an_engine_are_asked_from_the_engine(bounce, monkeypatch):
