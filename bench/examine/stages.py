@@ -286,17 +286,18 @@ class GradientStages:
     def _options(self, size: int, draws: int = -1) -> Options:
         """Return the options of the last stage with a number of other thetas, or by default those of more steps."""
         eps, is_right, is_large = step_sizes(self.simulator.unit), self.check.trusted, self.theta.size > MANY
-        has_all = draws >= 0 and (is_right or is_large or draws != FEW)
+        is_last = draws >= 0
+        has_all = is_last and (is_right or is_large or draws != FEW)
         return Options(
             components=size,
-            directions=2 * (draws >= 0),
+            directions=2 * is_last,
             draws=max(draws, 0),
             unit=self.simulator.unit,
             seed=self.seed,
             eps=eps if has_all or eps is not EPS else eps[::2],
             # a wrong gradient is named by its ratios at other thetas first, and then searched for staircases
-            scanned=4 if draws == MOST or (is_right and draws >= 0) else 0,
-            repeated=is_right and draws >= 0 and self.repeats.spread == 0.0,
+            scanned=4 if draws == MOST or (is_right and is_last) else 0,
+            repeated=is_right and is_last and self.repeats.spread == 0.0,
         )
 
     def _cost_of(self, options: Options, size: int) -> tuple[int, int]:

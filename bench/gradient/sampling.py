@@ -62,7 +62,7 @@ def sampled(
     repeatable = np.all(repeats(values, again, unit), axis=1)
     sides = at.reshape(size, n_lines, -1)[:, :, : 2 * count].reshape(size, -1)
     names = np.array([""] * sides.shape[1] if modes is None else modes(sides), dtype=object).reshape(n_lines, -1)
-    minus_modes, plus_modes = names[:, :count], names[:, count:]
+    minus_modes, plus_modes = np.split(names, 2, axis=1)
     numbers = np.broadcast_arrays(lines.derivatives, lines.lengths, lines.doubts, lines.moved)
     result = []
     for row, crossing, is_repeatable, *each in zip(
