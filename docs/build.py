@@ -163,7 +163,7 @@ def table_row(column: Column) -> str:
 RULE_MARKS = "<!-- verdicts -->\n", "<!-- end of verdicts -->"
 RULE_MODULES = (
     "gradient.causes gradient.check gradient.direction gradient.roughness gradient.sampling gradient.smooth_part examine.diagnosis "
-    "examine.facts examine.few examine.hints examine.means examine.smoothing examine.stages measure.jumps"
+    "examine.facts examine.few examine.hints examine.judged examine.means examine.smoothing examine.stages measure.jumps"
 )
 """The modules whose constants conditions of rules name."""
 

@@ -33,7 +33,7 @@ from bench.conformance.subjects import (
     with_changed_column,
 )
 from bench.engines.backend import EngineBackend
-from bench.gradient import EPS, FAULTS, TRUSTED, Check, Options, check, judge, sampled
+from bench.gradient import EPS, FAULTS, TRUSTED, Check, Lines, Options, check, judge, sampled
 from bench.gradient.direction import SINGLE_EPS
 from bench.host.parameters import parameters
 from bench.model import (
@@ -182,10 +182,7 @@ def _findings(backend: Backend, program: Program, distant: float, dtype: str) ->
         require(distant > 1.0 or np.isfinite(gradient).all(), f"{describe(program)}: not finite")
         found, *_ = sampled(
             lambda at: problem.value(at[:d], at[d:]),
-            np.concatenate([theta, w]),
-            np.concatenate([e, 0.0 * w]),
-            np.ones(N_COLUMNS),
-            (gradient * e).sum(axis=0),
+            Lines(np.concatenate([theta, w]), np.concatenate([e, 0.0 * w]), (gradient * e).sum(axis=0)),
             float(np.finfo(_dtype(backend)).eps),
             EPS if dtype == "float64" else SINGLE_EPS,
         )

@@ -162,10 +162,10 @@ def doubtful(parts: Iterable[Part], groups: Collection[str]) -> list[Part]:
     ]
 
 
-def smooth_parts(stages: GradientStages, outcome: Check) -> dict[str, SmoothPart | None]:
+def smooth_parts(stages: GradientStages) -> dict[str, SmoothPart | None]:
     """Return by name the slope of a rough cost's smooth part, for the doubtful parts that the budget allows."""
     random, found = np.random.default_rng([stages.seed, 0x776964]), dict[str, SmoothPart | None]()
-    for part in doubtful(outcome.parts, stages.groups):
+    for part in doubtful(stages.check.parts, stages.groups):
         if list(found.values()).count(None) == SMOOTH:
             found[part.name] = None
         elif stages.clock.can_afford(COSTS, share=MOST_OF_IT):
@@ -189,32 +189,23 @@ def noise_of_gradient(stages: GradientStages) -> float:
 
 
 @np.errstate(all="ignore")
-def step_of_difference(stages: GradientStages, outcome: Check) -> str:
+def step_of_difference(stages: GradientStages) -> str:
     """Return the step at which a difference of the cost is the wrong gradient, ``1e-04 max(1, |x|), forward``; empty where none is.
 
     A gradient by differences with too long or too short a step is off by the error of that step.
     """
-    wrong = [part for part in outcome.components if part.verdict in SUSPICIOUS][:DIFFERENCED]
+    wrong = [part for part in stages.check.components if part.verdict in SUSPICIOUS][:DIFFERENCED]
     is_same = np.full((2, DIFFERENCE_STEPS.size), bool(wrong))
     for part in wrong:
         steps = max(abs(float(stages.theta[part.component or 0])), 1.0) * DIFFERENCE_STEPS
         costs = stages.costs_along(_unit_vector(stages, part), np.r_[-steps, steps])
         minus, plus = np.split(costs, 2)
         slopes = np.stack([(plus - stages.value) / steps, (plus - minus) / (2 * steps)])
-        is_same &= np.abs(slopes - part.program) <= SAME * abs(part.program - part.difference)
+        is_same &= np.abs(slopes - part.program) <= SAME * part.apart
     for name, row in zip(("forward", "central"), is_same, strict=True):
         if row.any():
             return f"{DIFFERENCE_STEPS[int(np.argmax(row))]:.0e} max(1, |x|), {name}"
     return ""
-
-
-def grows(horizons: Sequence[Horizon], tolerance: float) -> bool:
-    """Return whether the gradient is right after few steps and its error grows with the number of steps."""
-    wrong = [one for one in horizons if one.is_wrong(tolerance)]
-    if len(horizons) < 2 or not wrong or horizons[0] in wrong:
-        return False
-    last = horizons[-1]
-    return last in wrong and (len(wrong) == 1 or last.error > GROWTH * wrong[0].error)
 
 
 @np.errstate(all="ignore")
@@ -223,7 +214,7 @@ def relative_error(outcome: Check) -> float:
 
     A discretisation changes all components by an amount of one size, which is large beside a small component.
     """
-    rows = [np.array([p.program - p.difference, p.difference]) * p.sample.scale for p in outcome.parts]
+    rows = [np.array([p.apart, p.difference]) * p.sample.scale for p in outcome.parts]
     errors, slopes = np.array([row for row in rows if np.isfinite(row).all()]).reshape(-1, 2).T
     return float(np.linalg.norm(errors) / np.linalg.norm(slopes))
 
@@ -233,9 +224,7 @@ def may_be_adaptive(outcome: Check) -> bool:
     return outcome.cause in SUSPICIOUS and relative_error(outcome) <= NEAR
 
 
-def is_adaptive(
-    stages: GradientStages, outcome: Check, lines: Sequence[LineScan], effort: tuple[int, int, int]
-) -> bool:
+def is_adaptive(stages: GradientStages, lines: Sequence[LineScan], effort: tuple[int, int, int]) -> bool:
     """Return whether the breaks of the cost explain the error of the gradient, as with adaptive steps.
 
     A solver with adaptive steps has another discretisation error on either side of each change of its sequence of steps: its
@@ -244,26 +233,26 @@ def is_adaptive(
     or an adjoint have steps of their own, so these gradients differ from differences by as much. Where the lines at theta show
     less, a long line along the error is searched, as :func:`scan` does with ``effort``.
     """
-    error = _error_vector(stages, outcome)
+    error = _error_vector(stages)
     size = float(np.linalg.norm(error / stages.scale))
     if not 0.0 < size < np.inf:
         return False
     count, slope = _breaks_of_steps(lines, stages.scale)
     if count >= FEWEST_BREAKS and size <= EXPLAINED * slope:
         return True
-    direction, noise = error / size, max(outcome.noise, stages.repeats.spread)
+    direction, noise = error / size, max(stages.check.noise, stages.repeats.spread)
     line = scan(partial(stages.costs_along, direction), direction, noise, LONG, effort, stages.simulator.unit)
     count, slope = _breaks_of_steps([*lines, line], stages.scale)
-    wrong = [part.error for part in outcome.components if part.verdict in SUSPICIOUS]
-    is_small = max(relative_error(outcome), *wrong) <= NEAR
+    wrong = [part.error for part in stages.check.components if part.verdict in SUSPICIOUS]
+    is_small = max(relative_error(stages.check), *wrong) <= NEAR
     if count < FEWEST_BREAKS:
         return is_small
     return size <= (EXPLAINED_IF_SMALL if is_small else EXPLAINED) * slope
 
 
-def _error_vector(stages: GradientStages, outcome: Check) -> np.ndarray:
+def _error_vector(stages: GradientStages) -> np.ndarray:
     """Return the displacement ``(d,)`` along which the gradient is most wrong, whose length in the scales is the error there."""
-    parts = [part for part in outcome.parts if part.component is not None or part.name in stages.groups]
+    parts = [part for part in stages.check.parts if part.component is not None or part.name in stages.groups]
     errors = ((p.program - p.difference) * p.sample.scale**2 * _unit_vector(stages, p) for p in parts)
     return sum(errors, np.zeros(stages.theta.size))
 

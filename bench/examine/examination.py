@@ -13,7 +13,9 @@ import numpy as np
 
 from bench.errors import UserError, unknown
 from bench.examine import diagnosis
-from bench.examine.facts import NOISE_CAUSES, RELATIVE, GroupSize, Setup, Spent
+from bench.examine.facts import NOISE_CAUSES
+from bench.examine.findings import Spent
+from bench.examine.judged import RELATIVE, GroupSize, Setup
 from bench.examine.lines import HALVINGS, PLACES, POINTS, REACH, SIDES, LineScan, scan
 from bench.examine.means import OF_A_DRAW, Mean, compare_means
 from bench.examine.report import Report
@@ -29,7 +31,7 @@ from bench.examine.smoothing import (
 )
 from bench.examine.stages import GradientStages
 from bench.examine.subspace import Group
-from bench.gradient import FAULTS, Check
+from bench.gradient import FAULTS
 from bench.gradient.rules import RULES, SUSPICIOUS
 from bench.simulator.clock import Clock, OutOfTime, parse_duration
 from bench.simulator.simulator import Simulator, accepts
@@ -245,24 +247,23 @@ class _Examination:
         """Run the checks that the budget allows, the decisive ones first, and return the report."""
         simulator, clock, stages, setup, explained = self.simulator, self.clock, self.stages, self.setup, self.explained
         stages.run(self._compare_early)
-        checked = stages.check
-        is_wrong = checked.cause in SUSPICIOUS
         gradient = stages.gradient
         has_gradient = gradient is not None
-        self._find_smooth_parts(checked)
-        if refined is not None and has_gradient and (is_wrong or explained.wide):
+        is_wrong = has_gradient and stages.check.cause in SUSPICIOUS
+        self._find_smooth_parts()
+        if refined is not None and (is_wrong or explained.wide):
             self._explain("refined", "the refined cost", diagnosis.refined_slopes, refined)
         if setup.horizons:
             self._explain("growth", "horizons", diagnosis.errors_by_horizon, setup.horizons)
-        if is_wrong and has_gradient:
-            self._explain("difference_step", "steps of a difference", diagnosis.step_of_difference, checked)
+        if is_wrong:
+            self._explain("difference_step", "steps of a difference", diagnosis.step_of_difference)
             self._explain("gradient_noise", "noise of the gradient", diagnosis.noise_of_gradient)
-        self._compare_means(checked)
+        self._compare_means()
         can_go_on = has_gradient or not simulator.has_gradient
-        if is_wrong and can_go_on and explained.is_adaptive is None:
-            explained.is_adaptive = self._compare_along_lines(checked, 0.9)
-        lines = self._scan_lines(checked) if can_go_on else []
-        smoothed = self._measure_noise(checked, lines) if can_go_on else []
+        if is_wrong and explained.is_adaptive is None:
+            explained.is_adaptive = self._compare_along_lines(0.9)
+        lines = self._scan_lines() if can_go_on else []
+        smoothed = self._measure_noise(lines) if can_go_on else []
         stages.repeat_failures()
         return Report(
             **named,
@@ -282,7 +283,7 @@ class _Examination:
                 clock.budget,
                 clock.calls,
             ),
-            check=checked,
+            check=stages.check,
             is_complete=stages.is_complete,
             located=stages.located,
             groups={k: self._size_of(v, gradient) for k, v in stages.groups.items() if gradient is not None},
@@ -332,24 +333,24 @@ class _Examination:
 
     # ------------------------------------------------------------------------------------------------ lines
 
-    def _compare_early(self, checked: Check) -> None:
+    def _compare_early(self) -> None:
         """Keep the smooth part of a rough cost, and whether adaptive steps explain the small error of a gradient."""
-        self._compare_means(checked)
-        self._find_smooth_parts(checked)
-        if diagnosis.may_be_adaptive(checked):
-            self.explained.is_adaptive = self._compare_along_lines(checked, EARLY_SHARE)
+        self._compare_means()
+        self._find_smooth_parts()
+        if diagnosis.may_be_adaptive(self.stages.check):
+            self.explained.is_adaptive = self._compare_along_lines(EARLY_SHARE)
 
-    def _compare_means(self, checked: Check) -> None:
+    def _compare_means(self) -> None:
         """Compare the mean over draws of a gradient that is not the derivative at one of them."""
-        is_of_a_draw = any(one.cause in OF_A_DRAW for one in (checked, *self.stages.more))
+        is_of_a_draw = any(one.cause in OF_A_DRAW for one in (self.stages.check, *self.stages.more))
         if self.means is None and self.simulator.noise and is_of_a_draw and self.stages.gradient is not None:
             self.means = self._attempt("the mean over draws", lambda: compare_means(self.stages), MEANS_SHARE)
 
-    def _find_smooth_parts(self, checked: Check) -> None:
+    def _find_smooth_parts(self) -> None:
         if self.stages.gradient is not None and not self.explained.wide:
-            self._explain("smooth_parts", "the smooth part of the cost", diagnosis.smooth_parts, checked)
+            self._explain("smooth_parts", "the smooth part of the cost", diagnosis.smooth_parts)
 
-    def _compare_along_lines(self, checked: Check, share: float) -> bool | None:
+    def _compare_along_lines(self, share: float) -> bool | None:
         """Return whether the program's steps depend on theta and its jumps explain the gradient's error.
 
         None where the budget ends before. Nothing here depends on sigma.
@@ -358,9 +359,9 @@ class _Examination:
             self._explain("steps", "the loops of the program", diagnosis.changing_steps)
         if not self.explained.steps:
             return None if self.explained.steps is None else False
-        near = self._scan_near(checked, share)
+        near = self._scan_near(share)
         effort = self._effort(0.9)
-        decide = partial(diagnosis.is_adaptive, self.stages, checked, near, effort)
+        decide = partial(diagnosis.is_adaptive, self.stages, near, effort)
         return self._attempt("the comparison along lines", decide) if near and effort[0] else None
 
     def _effort(self, share: float) -> tuple[int, int, int]:
@@ -371,49 +372,49 @@ class _Examination:
                 return effort
         return 0, 0, 0
 
-    def _scan_lines(self, checked: Check) -> list[LineScan]:
+    def _scan_lines(self) -> list[LineScan]:
         """Return scans of the cost over the noise, or near theta without sigma."""
         if not self.setup.levels:
-            return self._scan_near(checked, 0.9)
-        return self._scan(max(self.setup.levels, key=lambda level: level[0])[1], checked, 0.5)
+            return self._scan_near(0.9)
+        return self._scan(max(self.setup.levels, key=lambda level: level[0])[1], 0.5)
 
-    def _scan_near(self, checked: Check, share: float) -> list[LineScan]:
+    def _scan_near(self, share: float) -> list[LineScan]:
         if self._near is None:
-            self._near = self._scan(self.setup.scale * RELATIVE, checked, share)
+            self._near = self._scan(self.setup.scale * RELATIVE, share)
         return self._near
 
-    def _scan(self, spread: np.ndarray, checked: Check, share: float) -> list[LineScan]:
+    def _scan(self, spread: np.ndarray, share: float) -> list[LineScan]:
         """Return scans of the cost for jumps and kinks, along random directions through theta.
 
         They take at most ``share`` of the remaining budget.
         """
         along, unit, lines = directions(2, spread, self.setup.seed), self.simulator.unit, list[LineScan]()
         effort = self._effort(share / len(along))
-        sizes = [checked.noise, self.stages.repeats.spread, unit * abs(self.stages.value)]
+        sizes = [self.stages.check.noise, self.stages.repeats.spread, unit * abs(self.stages.value)]
         rounding = float(np.nan_to_num(sizes, posinf=0.0).max())
         with self.clock.stage("jumps and kinks on lines", self.left_out, min(1.0, 2 * share)):
             if not effort[0]:
                 raise OutOfTime
             for direction in along:
                 cost = partial(self.stages.costs_along, direction)
-                lines.append(self._integrated(scan(cost, direction, rounding, REACH, effort, unit), checked))
+                lines.append(self._integrated(scan(cost, direction, rounding, REACH, effort, unit)))
         if 0 < effort[0] < POINTS:
             self.left_out.append(
                 f"fine line scans: {effort[0]} points instead of {POINTS}, {effort[2]} places searched"
             )
         return lines
 
-    def _integrated(self, line: LineScan, checked: Check) -> LineScan:
+    def _integrated(self, line: LineScan) -> LineScan:
         """Return a line with the share of the cost's change that a right gradient does not explain.
 
         Without jumps, the integral of a right gradient along a line, by Gauss-Legendre, is the difference of the costs at
         its ends. The share is NaN without a right gradient, or where the integral is less accurate than both a tenth of
         the share and :data:`LEAST_MISSED`. Points at which the gradient is not a number, and the cost is, are counted instead.
         """
-        if not checked.trusted or not self.simulator.has_gradient:
+        if not self.stages.check.trusted or not self.simulator.has_gradient:
             return line
         changes = np.abs(np.diff(line.costs)).sum()
-        rounding = self.simulator.unit * np.abs(line.costs).max(initial=0.0) + checked.noise
+        rounding = self.simulator.unit * np.abs(line.costs).max(initial=0.0) + self.stages.check.noise
         # where the cost hardly changes, its rounding is all that the integral could miss
         if not (np.isfinite(changes) and changes > 0 and rounding < 0.1 * LEAST_MISSED * changes):
             return line
@@ -434,7 +435,7 @@ class _Examination:
 
     # ------------------------------------------------------------------------------------------------ noise
 
-    def _measure_noise(self, checked: Check, lines: Sequence[LineScan]) -> list[Smoothed]:
+    def _measure_noise(self, lines: Sequence[LineScan]) -> list[Smoothed]:
         """Return the gradient's bias and the methods' costs at each sigma, which all get an equal share of the budget."""
         levels, size = list(self.setup.levels), self.stages.theta.size
         if not levels and self.simulator.noise:
@@ -442,13 +443,12 @@ class _Examination:
         if levels and size > MOST_NOISY:
             self.left_out.append(f"noise on theta: it has more than {MOST_NOISY:,} numbers")
             return []
-        plain = self.stages.gradient if checked.trusted and not self.simulator.noise else None
+        plain = self.stages.gradient if self.stages.check.trusted and not self.simulator.noise else None
         results = []
         pairs = min(OWN_PAIRS if self.simulator.noise else PAIRS, max(FEWEST, HELD // size))
         for index, (level, spread) in enumerate(levels):
             unseen = partial(largest_unseen, lines, level / self.setup.reach) if self.setup.levels else None
-            given = (self.simulator, level, spread, plain, self.setup.seed, pairs, unseen)
-            measure = partial(measure_smoothed, *given)
+            measure = partial(measure_smoothed, self.simulator, level, spread, plain, self.setup.seed, pairs, unseen)
             results.append(self._attempt(f"noise of sigma {level:g}", measure, 1.0 / (len(levels) - index)))
         return [one for one in results if one]
 

@@ -6,27 +6,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
-from bench.examine.diagnosis import LOOSE, Explanation, Horizon, doubtful, grows, may_be_adaptive
-from bench.examine.hints import Hint, hint_of
-from bench.examine.lines import ALIKE, LineScan
+from bench.examine.diagnosis import GROWTH, Horizon, doubtful, may_be_adaptive
+from bench.examine.judged import JudgedCheck
 from bench.examine.means import OF_A_DRAW, Mean
 from bench.examine.smoothing import Smoothed
-from bench.examine.stages import Repeats, recaused
-from bench.gradient import FAULTS, TRUSTED, Check, Part, Sample, rules
-from bench.gradient.direction import MIN_STEPS, resolution
-from bench.gradient.roughness import FINE
+from bench.examine.stages import Repeats
+from bench.gradient import FAULTS, TRUSTED, Check, Part, Sample
+from bench.gradient.direction import MIN_STEPS
 from bench.gradient.rules import EXCUSABLE, SUSPICIOUS, UNEQUAL
-from bench.gradient.smooth_part import CLEAR, LIMIT
 from bench.report.text import counted, number, span
-from bench.simulator.simulator import unit_of
-from bench.simulator.tree import ParameterTree
 
-RELATIVE = 0.01
-"""Default sigma of the line scans, and of a cost with its own noise, in units of each input's scale."""
 SEEN = 0.01
 """Share of a cost's change along a line that the integral of the gradient may miss without a warning."""
 RESOLVED = 0.02
@@ -39,20 +31,13 @@ SLIGHT = 1e-5
 """Largest error of an unresolved derivative, relative to the largest derivative, both in units of the inputs' scales."""
 PART = 0.5
 """Largest share of such a slope that the gradient has: a factor or a sign is wrong however small the slope."""
-DEVIATIONS = 4.0
-"""Standard deviations of the slope along a random direction that errors within the tolerance do not exceed."""
-SEEN_ALONE = 4.0
-"""Multiple of a slope's error from which the error of one number shows along most random directions."""
-AGREES = 0.5
-"""Largest distance of a gradient that agrees with a refined cost, relative to that of the cost's own differences."""
 AS_FAR = 4.0
-"""Largest such distance over all thetas together where the steps depend on theta, so that the gradient has its own error."""
+"""Largest distance of a gradient from a refined cost, relative to that of the cost's own differences, over all thetas together: where the
+steps depend on theta, the gradient has its own error."""
 RESIDUE = 1e-4
 """Largest change of the cost by a gradient, relative to the height of a jump, that is a residue of a solver."""
 TINY = 1e-8
 """Scale of an input below which a slope that no difference shows counts, however small its change of the cost over the scale."""
-ROUGH = 0.1
-"""Share of the cost's change over the widest step that noise between neighbouring thetas makes up where a cost is rough."""
 HEADLINE = 200
 """Most characters of an exception in a headline."""
 NOISE_CAUSES = ("staircase", "jumps", "nonfinite", "nan_gradient", "biased", "spread", "unmeasured")
@@ -78,255 +63,26 @@ def _slope_nearby(sample: Sample) -> float:
 
 
 @dataclass(frozen=True)
-class GroupSize:
-    """What errors of a group's numbers do to the slope along its random direction, in units of their scales."""
-
-    count: int
-    """Number of numbers n."""
-    allowed: float
-    """Norm of the tolerated errors of the numbers."""
-    slope: float
-    """Norm of the gradient of the numbers."""
-
-    @property
-    def tolerated(self) -> float:
-        """Largest error of the slope from errors of its numbers that are all within their tolerance.
-
-        The direction is random and of length 1, so the slope's error has a standard deviation of ``allowed / sqrt(n)``.
-        """
-        return min(DEVIATIONS / math.sqrt(self.count), 1.0) * self.allowed
-
-    def hidden(self, error: float) -> float:
-        """Return the error of one number that a slope with ``error`` may hide, relative to the numbers' root mean square."""
-        return SEEN_ALONE * error * self.count / self.slope if self.slope > 0 else math.inf
-
-
-@dataclass(frozen=True)
-class Setup:
-    """The settings of an examination, per entry of theta where they are arrays ``(d,)``."""
-
-    levels: Sequence[tuple[float, np.ndarray]]
-    """Each sigma as a number for tables, its largest entry, and as an array."""
-    scale: np.ndarray
-    rtol: np.ndarray
-    """Tolerated relative error of each derivative."""
-    atol: np.ndarray
-    """Tolerated absolute error of each derivative."""
-    allow_zero: np.ndarray | None
-    """Whether each input may have no effect; None: such inputs cause a warning."""
-    seed: int
-    horizons: tuple[int, ...]
-
-    def tolerated(self, index: Any, slopes: Any) -> Any:
-        """Return the largest errors of slopes by inputs that only cause a warning."""
-        return self.atol[index] + self.rtol[index] * np.abs(slopes)
-
-    @property
-    def sigmas(self) -> list[float]:
-        """The given values of sigma."""
-        return [level for level, _ in self.levels]
-
-    def shown(self, level: float) -> str:
-        """Return a sigma as text: its smallest and largest standard deviation above 0, or one number where they are the same."""
-        each = next((spread[spread > 0] for one, spread in self.levels if one == level), np.array([level]))
-        return span(float(each.min()), float(each.max()))
-
-    @property
-    def reach(self) -> float:
-        """One standard deviation on the lines: the largest sigma, or without one a share of the scale of each input."""
-        return max(self.sigmas, default=RELATIVE)
-
-
-@dataclass(frozen=True)
-class Spent:
-    """What an examination took, and its limits."""
-
-    costs: int
-    """Number of costs computed, one per theta."""
-    gradients: int
-    """Number of gradients computed, one per theta."""
-    seconds: float
-    """Time within the budget [s]."""
-    compile_s: float
-    """Time of first calls [s]."""
-    cost_s: float
-    """Time of one cost [s]."""
-    gradient_s: float
-    """Time of one gradient [s]; NaN without a gradient."""
-    budget: float
-    calls: float
-    """Limit of costs and gradients together."""
-
-
-@dataclass(frozen=True)
-class Facts:
+class Facts(JudgedCheck):
     """The facts about a cost and its gradient at one theta, from which verdicts follow."""
 
-    name: str
-    """Name of the cost."""
     gradient: str
     """Source of the gradient: ``jax``, ``torch``, a function's name, or empty for differences only."""
-    layout: ParameterTree
     cost: float
-    precision: str
-    batch: str
     repeats: Repeats
-    setup: Setup
-    spent: Spent
-    check: Check
-    """The gradient check; without parts if it did not finish within the budget."""
     is_complete: bool
     """Whether every chosen component and group was checked."""
     located: dict[str, tuple[int, int]]
     """By name of a wrong group: the first of the numbers that cause its error, and the last + 1."""
-    groups: dict[str, GroupSize]
-    """By name of a group of numbers that move along one random direction: its size."""
-    more: Sequence[Check]
-    """Checks under further draws of the simulator's own noise."""
-    explained: Explanation
-    """Comparisons that explain a wrong gradient."""
     is_random: bool
     """Whether the cost has noise of its own."""
     means: Mean | None
     """The mean of a gradient that is not the derivative at a fixed draw of the cost's noise; None: not compared."""
-    lines: Sequence[LineScan]
     smoothed: Sequence[Smoothed]
     error: str
     """The first exception that the gradient raised; empty if none."""
     is_failed: bool
     """Whether it did at theta."""
-    n_failed: int
-    """Number of gradient calls that raised an exception."""
-    printed: Sequence[str]
-    """The lines that cost and gradient printed."""
-    notes: Sequence[str]
-    left_out: Sequence[str]
-    """The parts of the examination that the budget did not allow."""
-    enough: tuple[float, float]
-    """Costs and gradients with which nothing is left out."""
-    expect: str = ""
-    """The known cause with which the report passes."""
-    command: str = ""
-    """The command line of this report, or empty."""
-    changes: Sequence[str] = ()
-    """Differences from the baseline."""
-    is_as_before: bool = False
-    """Whether there is a baseline and nothing is worse."""
-    takes_steps: bool = False
-    """Whether cost and gradient take ``steps``, a number of steps."""
-
-    # ------------------------------------------------------------------------------------------ the check, judged
-
-    @cached_property
-    def settled(self) -> Check:
-        """The check with tolerated errors counted as right."""
-        if self.named.cause not in UNEQUAL:
-            return self.named
-        return recaused(self.named, lambda part: replace(part, verdict="nonlinear") if self._is_small(part) else part)
-
-    @cached_property
-    def named(self) -> Check:
-        """The check with the cause of :attr:`hint` as the verdict of wrong derivatives."""
-        check = self.judged
-        if self.hint is None:
-            return check
-        cause = self.hint.cause if self.hint.cause in SUSPICIOUS else "wrong_adjoint"
-        return recaused(check, lambda part: replace(part, verdict=cause) if part.verdict in SUSPICIOUS else part)
-
-    @cached_property
-    def judged(self) -> Check:
-        """The check with derivatives of a rough cost, or of one with adaptive steps, judged by its smooth part or a refined cost."""
-        has_smooth_part = self.explained.wide or (self.explained.steps and self._agrees_with_refined)
-        if not has_smooth_part or self.tread or self.is_rough:
-            return self.check
-        return recaused(self.check, self._of_smooth_part)
-
-    @cached_property
-    def is_rough(self) -> bool:
-        """Whether an unsettled cost varies as much between neighbours as over a wide step, and the gradient does not say so.
-
-        In chaos it does, and is not blamed.
-        """
-        samples = [p.sample for one in [self.check, *self.more] if one.cause == "unsettled" for p in one.parts]
-        return any(
-            one.noise > ROUGH * np.abs(one.plus - one.minus)[one.finite].max(initial=0.0)
-            and one.noise > max(1e6 * one.unit * abs(one.centre), abs(one.derivative) * FINE * one.scale)
-            for one in samples
-        )
-
-    @property
-    def _is_averaged(self) -> bool:
-        """Whether wide steps meet several sequences of steps, along each wrong part: the slope over them is another than at tiny steps."""
-        smooth, wrong = self.explained.smooth_parts, {p.name for p in self.settled.parts if p.verdict in UNEQUAL}
-        known = [(part, wide) for part in self.check.parts if (wide := smooth.get(part.name))]
-        is_other = any(abs(wide.slope - part.difference) > wide.error + part.uncertainty for part, wide in known)
-        return is_other and wrong <= {part.name for part, _ in known}
-
-    @cached_property
-    def _refined(self) -> dict[str, float]:
-        """The refined cost's derivatives by component; empty without a refined cost."""
-        slopes = self.explained.refined.components[0, 2] if self.explained.refined else []
-        return {p.name: float(one) / p.sample.scale for p, one in zip(self.check.components, slopes, strict=False)}
-
-    def _of_smooth_part(self, part: Part) -> Part:
-        """Return a part of a rough cost with the verdict that wide steps, or a refined cost, give.
-
-        Random directions of all numbers and other thetas were compared at tiny steps only, which show nothing there.
-        """
-        explained, is_open = self.explained, part.verdict in (*UNEQUAL, "unsettled")
-        group, index = self.groups.get(part.name), part.component
-        if index is None and group is None:
-            return replace(part, verdict="smooth_part") if is_open or part.verdict in rules.BROKEN else part
-        wide, refined = explained.smooth_parts.get(part.name), self._refined.get(part.name)
-        is_known = wide is None and refined is None and (part.name in explained.smooth_parts or not is_open)
-        if is_known or not doubtful([part], self.groups):
-            return part
-        slope, error = (part.difference, math.inf) if wide is None else (wide.slope, wide.error)
-        if refined is not None:
-            size = max(abs(refined), abs(part.program))
-            slope, error = refined, min(abs(slope - refined) + error, LOOSE * size)
-        # the slope along a random direction may be 0 by chance
-        size = max(abs(slope), abs(part.program), group.slope / math.sqrt(group.count) if group else 0.0)
-        rtol, atol = (0.0, group.tolerated) if group else (self.setup.rtol[index], self.setup.atol[index])
-        tolerance, apart = max(float(rtol), resolution(self.unit)), abs(part.program - slope)
-        allowed = tolerance * size + float(atol)
-        is_rough = any(each.error > tolerance * abs(each.slope) for each in explained.wide)
-        doubt = CLEAR * error
-        if refined is None and is_rough and error <= allowed:
-            error = LOOSE * size  # of one sequence of steps, whose changes other parts show
-        if error > LIMIT * size or error < apart - allowed <= doubt:
-            verdict = "unsettled"
-        elif apart > error + allowed:
-            if not is_open and abs(part.program - part.difference) <= 2.0 * part.uncertainty:
-                return part  # right of one sequence of steps
-            verdict = part.verdict if part.verdict in UNEQUAL else "wrong_adjoint"
-        else:
-            verdict = "smooth_part" if error <= allowed or refined is not None else "coarse"
-        return replace(part, verdict=verdict, difference=slope, uncertainty=error)
-
-    @cached_property
-    def hint(self) -> Hint | None:
-        """The explanation of a wrong gradient that fits its numbers; None without one."""
-        return hint_of(self.judged, self.theta, self.explained)
-
-    @cached_property
-    def _tolerated(self) -> float:
-        """Largest error of a slope along a random direction of components and groups that are all within their tolerance."""
-        parts = self.check.components
-        sizes = [part.sample.scale * float(self.setup.tolerated(part.component, part.difference)) for part in parts]
-        sizes += [group.allowed for group in self.groups.values()]
-        return GroupSize(max(len(sizes), 1), float(np.linalg.norm(np.nan_to_num(sizes))), 0.0).tolerated
-
-    def _is_small(self, part: Part) -> bool:
-        """Return whether a wrong part's error is within the tolerance."""
-        if part.verdict not in UNEQUAL:
-            return False
-        group = self.groups.get(part.name)
-        if part.component is not None:
-            allowed = self.setup.tolerated(part.component, part.difference)
-        else:
-            allowed = group.tolerated if group else max(self._tolerated, self.setup.rtol.max() * abs(part.difference))
-        return bool(abs(part.program - part.difference) <= allowed)
 
     @cached_property
     def unresolved(self) -> list[Part]:
@@ -417,7 +173,7 @@ class Facts:
         repeats = self.repeats
         noise = repeats.of_gradient * np.linalg.norm([p.program for p in self.settled.components])
         error = part.uncertainty + repeats.spread / part.step + noise
-        return bool(abs(part.program - part.difference) > CONTRADICTED * error)
+        return bool(part.apart > CONTRADICTED * error)
 
     @property
     def spread_text(self) -> str:
@@ -462,10 +218,11 @@ class Facts:
         if not self.wrong_checks:
             return []
         check = self.wrong_checks[0]
-        located = [part for part in check.parts if part.name in self.located]
         inside = [part for part in check.worst_parts if part.component is not None]
         exact = [part for part in inside if part.component in self._located_numbers]
-        return exact or [*located, *inside] or list(check.worst_parts)
+        return (
+            exact or [*(part for part in check.parts if part.name in self.located), *inside] or list(check.worst_parts)
+        )
 
     @property
     def _located_numbers(self) -> set[int]:
@@ -475,12 +232,11 @@ class Facts:
     def is_slight(self) -> bool:
         """Whether the gradient has little of slopes that are so small beside right ones that a solver's error may make them."""
         check = self.wrong_checks[0]
-        right = [abs(part.difference) * part.sample.scale for part in check.components if part.verdict in TRUSTED]
-        largest = max(right, default=0.0)
+        right = [part for part in check.components if part.verdict in TRUSTED]
+        largest = max((abs(part.difference) * part.sample.scale for part in right), default=0.0)
         wrong = [part for part in (*check.parts, *check.draws) if part.verdict in UNEQUAL]
         return bool(wrong) and all(
-            abs(part.program - part.difference) * part.sample.scale <= SLIGHT * largest
-            and abs(part.program) <= PART * abs(part.difference)
+            part.apart * part.sample.scale <= SLIGHT * largest and abs(part.program) <= PART * abs(part.difference)
             for part in wrong
         )
 
@@ -500,19 +256,17 @@ class Facts:
         return self._agrees_with_refined or (is_varied and is_near)
 
     @property
-    def _agrees_with_refined(self) -> bool:
-        """Whether the gradient agrees with a refined cost where the cost's own differences do not, at every theta compared."""
-        return bool(self._gaps) and all((gradient <= AGREES * own).all() for gradient, own in self._gaps)
-
-    @cached_property
-    def _gaps(self) -> list[np.ndarray]:
-        """Distances by theta of gradient and of own differences from a refined cost: by component, and along random directions."""
-        return [np.linalg.norm(slopes[:, :2] - slopes[:, 2:], axis=2).T for slopes in self.explained.refined or ()]
-
-    @property
     def _is_decided(self) -> bool:
         """Whether the slope of a rough cost's smooth part is known beyond doubt about its sequences of steps."""
         return bool(self.explained.wide) and (self.explained.refined is not None or self._is_averaged)
+
+    @property
+    def _is_averaged(self) -> bool:
+        """Whether wide steps meet several sequences of steps, along each wrong part: the slope over them is another than at tiny steps."""
+        smooth, wrong = self.explained.smooth_parts, {p.name for p in self.settled.parts if p.verdict in UNEQUAL}
+        known = [(part, wide) for part in self.check.parts if (wide := smooth.get(part.name))]
+        is_other = any(abs(wide.slope - part.difference) > wide.error + part.uncertainty for part, wide in known)
+        return is_other and wrong <= {part.name for part, _ in known}
 
     @property
     def may_be_explained(self) -> bool:
@@ -525,18 +279,21 @@ class Facts:
     @property
     def grows(self) -> bool:
         """Whether the gradient is right after few steps, and its error grows with their number."""
-        return grows(self.explained.growth, self._tolerance_of_horizons)
+        growth, late = self.explained.growth, self._late
+        if not late or growth[0] in late:
+            return False
+        return growth[-1] in late and (len(late) == 1 or growth[-1].error > GROWTH * late[0].error)
 
     @property
     def latest(self) -> Horizon | None:
         """The most wrong of the compared numbers of steps; None if the gradient is right at all."""
-        growth, tolerance = self.explained.growth, self._tolerance_of_horizons
-        is_late = any(one.is_wrong(tolerance) for one in growth)
-        return max(growth, key=lambda one: one.error) if is_late else None
+        return max(self.explained.growth, key=lambda one: one.error) if self._late else None
 
     @property
-    def _tolerance_of_horizons(self) -> float:
-        return max(float(self.setup.rtol.max()), 1e-3)
+    def _late(self) -> list[Horizon]:
+        """The compared numbers of steps after which the gradient is wrong."""
+        tolerance = max(float(self.setup.rtol.max()), 1e-3)
+        return [one for one in self.explained.growth if one.is_wrong(tolerance)]
 
     # -------------------------------------------------------------------------------------------- around theta
 
@@ -547,13 +304,13 @@ class Facts:
         A gradient that follows the slopes of the draws, and whose mean is off, is none.
         """
         means = self.means
-        follows = means is not None and means.is_of_draws and means.is_decisive and means.cause == "biased"
+        follows = means and means.is_of_draws and means.is_decisive and means.cause == "biased"
         return self.is_random and self.failed in OF_A_DRAW and not follows
 
     @property
     def cause_of_mean(self) -> str:
         """The verdict on a gradient that is not the derivative of each draw, but may be an estimator."""
-        if self.means is not None and self.means.is_decisive:
+        if self.means and self.means.is_decisive:
             return self.means.cause
         causes = [one.cause or ("estimator" if one.is_usable else "spread") for one in self.smoothed]
         return min(causes, key=(*NOISE_CAUSES, "estimator").index, default="unmeasured")
@@ -562,9 +319,9 @@ class Facts:
     def mean_text(self) -> str:
         """By how much the mean of a gradient over draws is off."""
         means = self.means
-        if means is not None and means.n_lost:
+        if means and means.n_lost:
             return f"at {means.n_lost} of {means.draws} draws"
-        if means is not None and means.is_decisive:
+        if means and means.is_decisive:
             off = span(100 * max(means.error - means.doubt, 0.0), 100 * (means.error + means.doubt))
             return f"its mean over {means.draws} draws is off by {off}%"
         known = [one for one in self.smoothed if one.known]
@@ -592,23 +349,7 @@ class Facts:
         """Whether theta moves the cost beside a flat part at theta: by jumps on a line, or under noise."""
         return any(line.jumps for line in self.lines) or any(one.n_moved for one in self.smoothed)
 
-    @property
-    def tread(self) -> float:
-        """Height of the jumps, if all lines have equal, evenly spaced jumps; else 0."""
-        treads = [line.tread for line in self.lines] or [0.0]
-        return max(treads) if min(treads) > (1 - ALIKE) * max(treads) else 0.0
-
     # -------------------------------------------------------------------------------------------------- names
-
-    @property
-    def unit(self) -> float:
-        """The unit roundoff of the cost's arithmetic."""
-        return unit_of(self.precision)
-
-    @property
-    def theta(self) -> np.ndarray:
-        """The vector ``(d,)``."""
-        return self.layout.vector
 
     @property
     def n_checked(self) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -30,8 +32,54 @@ FAILED = (WRONG, UNSHOWN, BROKEN)
 """Answers that decide before noise does."""
 
 
+@dataclass(frozen=True)
+class Spent:
+    """What an examination took, and its limits."""
+
+    costs: int
+    """Number of costs computed, one per theta."""
+    gradients: int
+    """Number of gradients computed, one per theta."""
+    seconds: float
+    """Time within the budget [s]."""
+    compile_s: float
+    """Time of first calls [s]."""
+    cost_s: float
+    """Time of one cost [s]."""
+    gradient_s: float
+    """Time of one gradient [s]; NaN without a gradient."""
+    budget: float
+    calls: float
+    """Limit of costs and gradients together."""
+
+
+@dataclass(frozen=True)
 class Findings(Facts):
-    """The facts about a cost and its gradient at one theta, and the verdicts that follow from them."""
+    """The facts about a cost and its gradient at one theta, the verdicts that follow from them, and what a report says besides."""
+
+    name: str
+    """Name of the cost."""
+    batch: str
+    spent: Spent
+    n_failed: int
+    """Number of gradient calls that raised an exception."""
+    printed: Sequence[str]
+    """The lines that cost and gradient printed."""
+    notes: Sequence[str]
+    left_out: Sequence[str]
+    """The parts of the examination that the budget did not allow."""
+    enough: tuple[float, float]
+    """Costs and gradients with which nothing is left out."""
+    expect: str = ""
+    """The known cause with which the report passes."""
+    command: str = ""
+    """The command line of this report, or empty."""
+    changes: Sequence[str] = ()
+    """Differences from the baseline."""
+    is_as_before: bool = False
+    """Whether there is a baseline and nothing is worse."""
+    takes_steps: bool = False
+    """Whether cost and gradient take ``steps``, a number of steps."""
 
     # ------------------------------------------------------------------------------------------ the derivative
 
@@ -91,13 +139,10 @@ class Findings(Facts):
     @property
     def hidden(self) -> float:
         """Relative error of one typical number that the check of its group may not show; 0 without groups."""
-        parts = [part for part in self.check.parts if part.name in self.groups]
         errors = [
-            self.groups[part.name].hidden(
-                max(abs(part.program - part.difference), CONTRADICTED * part.uncertainty + part.sample.doubt)
-            )
-            for part in parts
-            if part.verdict in TRUSTED or self._is_small(part)
+            self.groups[part.name].hidden(max(part.apart, CONTRADICTED * part.uncertainty + part.sample.doubt))
+            for part in self.check.parts
+            if part.name in self.groups and (part.verdict in TRUSTED or self._is_small(part))
         ]
         return max((error for error in errors if math.isfinite(error)), default=0.0)
 

@@ -193,18 +193,18 @@ def _summary(
     size, pairs = spread.size, drawn.shape[1]
     # an input without noise has no smoothed derivative
     noisy = spread > 0
-    spread, dim = spread[noisy], int(noisy.sum())
+    spread = spread[noisy]
+    largest = spread.max()
     d = drawn[size]
     u, up, down = (drawn[first : first + size][noisy] for first in (0, size + 1, 2 * size + 1))
-    plain = None if plain is None else plain[noisy]
     if not np.isfinite(d).all():
         share = f"{int((~np.isfinite(d)).sum())} of {pairs} pairs have a cost that is not a number"
-        return Smoothed(sigma, np.full(dim, np.nan), math.inf, math.nan, pairs, remark=share)
+        return Smoothed(sigma, np.full(spread.size, np.nan), math.inf, math.nan, pairs, remark=share)
     # in units of the largest sigma: an input's share of the bias is by how much it moves the cost under its own noise
-    weight = (spread / spread.max())[:, None]
+    weight = (spread / largest)[:, None]
     up, down = weight * up, weight * down
-    terms = d * u / spread.max()
-    groups = _means(_terms(u, d) / spread.max())
+    terms = d * u / largest
+    groups = _means(_terms(u, d) / largest)
     truth = groups.mean(axis=0)
     error = float(np.sqrt(groups.var(axis=0, ddof=1).sum() / GROUPS))
     norm = math.sqrt(max(float(truth @ truth) - error**2, 0.0))
@@ -212,27 +212,30 @@ def _summary(
     jumps = event = 0.0
     remark = ""
     slopes = (up + down) / 2.0
-    n_lost = int((~np.isfinite(slopes).all(axis=0)).sum()) if simulator.has_gradient else 0
-    if np.isfinite(slopes).all():
-        judged = summarise(_means(slopes) - groups, Truth.exact(np.zeros(dim)), pairs // GROUPS)
-        jumps, event = np.array(unseen(2 * pairs) if unseen else (0.0, 0.0)) / spread.max()
-        bias, low, high = judged.bias, judged.bias_low, max(judged.bias_high, float(jumps))
+    is_finite = np.isfinite(slopes).all(axis=0)
+    n_lost = int((~is_finite).sum()) if simulator.has_gradient else 0
+    if is_finite.all():
+        judged = summarise(_means(slopes) - groups, Truth.exact(np.zeros(spread.size)), pairs // GROUPS)
+        jumps, event = (np.array(unseen(2 * pairs) if unseen else (0.0, 0.0)) / largest).tolist()
+        bias, low, high = judged.bias, judged.bias_low, max(judged.bias_high, jumps)
         # heavy tails make an interval unreliable, which does not matter for a narrow one
         remark = judged.note if high - low > SMALL_BIAS * norm else ""
     elif n_lost:
         remark = f"{n_lost} of {pairs} pairs have a gradient that is not a number"
     if plain is not None:
-        moved = float(np.linalg.norm(truth - weight[:, 0] * plain))
+        moved = float(np.linalg.norm(truth - weight[:, 0] * plain[noisy]))
     methods: list[Method] = []
     if norm > CLEAR * error:
         each, slope = map(simulator.clock.seconds_per, KINDS)
         methods.append(_method("smoothing", (0.0, 0.0), terms, norm, 2, each))
         if plain is not None:
-            ends = max(moved - 2.0 * error, 0.0), max(moved + 2.0 * error, float(jumps))
-            methods.append(_method("plain", ends, np.zeros((dim, 2)), norm, 1, slope))
-        if np.isfinite(slopes).all():
-            methods.append(_method("gradient", (low, high), up, norm, 1, slope))
-            methods.append(_method("mirrored", (low, high), slopes, norm, 2, slope))
+            ends = max(moved - 2.0 * error, 0.0), max(moved + 2.0 * error, jumps)
+            methods.append(_method("plain", ends, np.zeros((spread.size, 2)), norm, 1, slope))
+        if is_finite.all():
+            methods += [
+                _method("gradient", (low, high), up, norm, 1, slope),
+                _method("mirrored", (low, high), slopes, norm, 2, slope),
+            ]
         methods.sort(key=lambda m: (math.isnan(m.seconds), m.seconds))
     return Smoothed(
         sigma,
@@ -240,15 +243,15 @@ def _summary(
         error,
         norm,
         pairs,
-        bias,
-        low,
-        high,
-        moved,
-        remark,
-        tuple(methods),
-        int((d != 0.0).sum()),
-        n_lost,
-        float(event),
+        bias=bias,
+        bias_low=low,
+        bias_high=high,
+        moved=moved,
+        remark=remark,
+        methods=tuple(methods),
+        n_moved=int((d != 0.0).sum()),
+        n_lost=n_lost,
+        unseen=event,
     )
 
 

@@ -160,8 +160,8 @@ class GradientStages:
 
     # ------------------------------------------------------------------------------------------------ stages
 
-    def run(self, explain: Callable[[Check], None]) -> None:
-        """Run all stages that the budget allows; ``explain`` gets the outcome of a wrong gradient before it is named."""
+    def run(self, explain: Callable[[], None]) -> None:
+        """Run all stages that the budget allows; ``explain`` is called where a gradient is wrong, before its cause is named."""
         with self.clock.stage("the gradient check", self.left_out):
             self._start()
         if self.left_out:
@@ -286,17 +286,18 @@ class GradientStages:
     def _options(self, size: int, draws: int = -1) -> Options:
         """Return the options of the last stage with a number of other thetas, or by default those of more steps."""
         eps, is_right, is_large = step_sizes(self.simulator.unit), self.check.trusted, self.theta.size > MANY
-        has_all = draws >= 0 and (is_right or is_large or draws != FEW)
+        is_last = draws >= 0
+        has_all = is_last and (is_right or is_large or draws != FEW)
         return Options(
             components=size,
-            directions=2 * (draws >= 0),
+            directions=2 * is_last,
             draws=max(draws, 0),
             unit=self.simulator.unit,
             seed=self.seed,
             eps=eps if has_all or eps is not EPS else eps[::2],
             # a wrong gradient is named by its ratios at other thetas first, and then searched for staircases
-            scanned=4 if draws == MOST or (is_right and draws >= 0) else 0,
-            repeated=is_right and draws >= 0 and self.repeats.spread == 0.0,
+            scanned=4 if draws == MOST or (is_right and is_last) else 0,
+            repeated=is_right and is_last and self.repeats.spread == 0.0,
         )
 
     def _cost_of(self, options: Options, size: int) -> tuple[int, int]:
@@ -320,13 +321,13 @@ class GradientStages:
         costs, gradients = (before + one / share for before, one in zip(more, last, strict=True))
         return costs + 2 * len(ROUNDS) * size + NOISE_POINTS, gradients + NOISE_POINTS
 
-    def _check_in_stages(self, space: Subspace, explain: Callable[[Check], None]) -> None:
+    def _check_in_stages(self, space: Subspace, explain: Callable[[], None]) -> None:
         if not self._run_stage("more steps", space, self._options(space.size), SHARE):
             return
         draws = [MOST, FEW, 0] if self.theta.size <= MANY else [FEW, 0]
         is_wrong = any(part.verdict in FAULTS for part in self.check.parts)
         if is_wrong:
-            explain(self.check)
+            explain()
             draws = draws[
                 -2::-1
             ]  # named by few thetas first, so that the name does not depend on the time that is left
@@ -358,8 +359,8 @@ class GradientStages:
             return self._check_once(space, replace(options, repeated=False), w)
         if self.simulator.raised["gradients"]:
             # a gradient that raises at other thetas is reported as such
-            outcome = replace(outcome, draws=tuple(part for part in outcome.draws if np.isfinite(part.program)))
-            outcome = recaused(outcome)
+            draws = tuple(part for part in outcome.draws if np.isfinite(part.program))
+            outcome = recaused(replace(outcome, draws=draws))
         outcome = _with_zeros(outcome)
         if outcome.cause == "nondeterministic" and not is_own and not self.repeats.is_large:
             outcome = recaused(outcome)  # only the last digits of the gradient differ
@@ -382,7 +383,6 @@ class GradientStages:
 
         Its error is a small part of the slope of its group, which may be within the tolerance.
         """
-        assert self.gradient is not None
         space = Subspace(self.layout, self.scale, [index], [])
         quick = FewSteps(space, self.costs, self.gradient, self.value, self.simulator.unit, self.repeats.spread)
         for step in ROUNDS:

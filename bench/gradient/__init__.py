@@ -3,7 +3,7 @@
 from .check import Check, Options, Part, check, settle
 from .direction import EPS, Sample, best, judge, step_sizes
 from .rules import BROKEN, FAULTS, RULES, TRUSTED, UNDECIDED, VERDICTS
-from .sampling import sampled
+from .sampling import Lines, sampled
 
 __all__ = [
     "BROKEN",
@@ -14,6 +14,7 @@ __all__ = [
     "UNDECIDED",
     "VERDICTS",
     "Check",
+    "Lines",
     "Options",
     "Part",
     "Sample",

@@ -14,7 +14,7 @@ from . import roughness
 from .causes import Ratio, causes_of_ratios
 from .direction import EPS, FINE, GUARD, Finding, Function, Sample, judge
 from .rules import FAULTS, RULES, TRUSTED, UNEQUAL, VERDICTS
-from .sampling import Modes, repeats, sampled
+from .sampling import Lines, Modes, repeats, sampled
 
 Tangent = Callable[[np.ndarray, np.ndarray], float]
 """A derivative at a theta along a direction, both ``(d,)``, from the cost's code but not from its gradient; NaN if unknown."""
@@ -106,16 +106,21 @@ class Part(Finding):
             return float(np.float64(self.program) / np.float64(self.difference))
 
     @property
+    def apart(self) -> float:
+        """|program - difference|."""
+        return abs(self.program - self.difference)
+
+    @property
     def error(self) -> float:
         """|program - difference| over the larger of the two; 0 for two zeros."""
         size = max(abs(self.program), abs(self.difference))
-        return 0.0 if size == 0.0 else abs(self.program - self.difference) / size
+        return 0.0 if size == 0.0 else self.apart / size
 
     @property
     def distance(self) -> float:
         """|program - difference| over the difference; infinite where that is not a number."""
         with np.errstate(all="ignore"):
-            apart = np.abs(self.program - np.float64(self.difference)) / np.abs(self.difference)
+            apart = self.apart / np.float64(abs(self.difference))
         return float("inf") if np.isnan(apart) else float(apart)
 
     @property
@@ -241,17 +246,14 @@ def settle(
     cost: Function, theta: np.ndarray, vector: np.ndarray, length: float, sample: Sample, tangent: Tangent | None
 ) -> Finding | None:
     """Return the finding on an unsettled direction from smaller steps or from the tangent; None if it stays unsettled."""
-    length_, derivative, doubt, moved = np.array([[length], [sample.derivative], [sample.doubt], [sample.moved]])
-    (fine,), *_ = sampled(
-        cost, theta, vector[:, None], length_, derivative, sample.unit, FINE, doubts=doubt, moved=moved
-    )
+    line = Lines(theta, vector[:, None], np.array([sample.derivative]), length, sample.doubt, sample.moved)
+    (fine,), *_ = sampled(cost, line, sample.unit, FINE)
     better = judge(fine)
     if better.verdict != "unsettled":
         return better
     slope = float("nan") if tangent is None else tangent(theta, vector) / length
-    known = judge(sample)
     if abs(slope - sample.derivative) <= AGREES * abs(slope):
-        return replace(known, verdict="nonlinear", difference=slope, uncertainty=AGREES * abs(slope))
+        return replace(judge(sample), verdict="nonlinear", difference=slope, uncertainty=AGREES * abs(slope))
     return None
 
 
@@ -368,18 +370,14 @@ class _Checker:
         # a component this much smaller than the others may be only their error, unless it is exactly 0
         doubt = np.maximum(np.sqrt(self.unit), self.options.step / lengths)
         doubts = np.where(program != 0.0, doubt * largest / lengths, 0.0)
+        moved = np.abs(vectors).T @ self._moved / lengths
         samples, minus, plus = sampled(
             self.cost,
-            thetas,
-            vectors,
-            lengths,
-            program,
+            Lines(thetas, vectors, program, lengths, doubts, moved),
             self.unit,
             self.options.eps,
             self._modes,
             is_thorough and self.options.repeated,
-            doubts,
-            np.abs(vectors).T @ self._moved / lengths,
         )
         if self._gradient is None:
             samples = [replace(sample, derivative=judge(sample).difference) for sample in samples]
@@ -410,7 +408,7 @@ class _Checker:
 
         ``largest`` is the largest |gradient * scale| at each line's theta. No solver excuses an error that is plainly wrong.
         """
-        errors = [line.length * abs(part.difference - part.program) for line, part in zip(lines, parts, strict=True)]
+        errors = [line.length * part.apart for line, part in zip(lines, parts, strict=True)]
         wrong = [m for m, part in enumerate(parts) if part.verdict == "wrong_adjoint"]
         if all(errors[m] <= LOOSE * largest[m] for m in wrong):
             for m in wrong:

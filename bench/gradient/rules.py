@@ -200,7 +200,7 @@ EXAMINATION = {
     "rough": Rule(
         "fault",
         "the cost changes as much between neighbouring thetas as over a wide step",
-        "`unsettled`, and neighbours by {facts.ROUGH:.0%} of the largest change, which the gradient does not explain",
+        "`unsettled`, and neighbours by {judged.ROUGH:.0%} of the largest change, which the gradient does not explain",
         "look for a seed or hash taken from theta",
     ),
     "overwritten": Rule(
@@ -266,7 +266,7 @@ EXAMINATION = {
         "`missing_term` or `wrong_adjoint` where a loop's length depends on theta, and the error is at most {diagnosis.EXPLAINED:g} times "
         "the slope of {diagnosis.FEWEST_BREAKS} or more jumps, over the length of a line, and kinks; or {diagnosis.EXPLAINED_IF_SMALL:g} times, or there are fewer "
         "breaks, where it and that of each wrong component are at most {diagnosis.NEAR:.0%}; jumps above {diagnosis.MOST_OF_CHANGE:.0%} of the cost's change on their line are events and do not count. With `refined`: the gradient is at "
-        "most {facts.AGREES:g} times as far from it as the differences at each theta, or {facts.AS_FAR:g} times beside such a loop. "
+        "most {judged.AGREES:g} times as far from it as the differences at each theta, or {facts.AS_FAR:g} times beside such a loop. "
         "Of a rough cost: no slope over wide steps is known to {smooth_part.LIMIT:.0%}",
         "give the cost at a tighter tolerance; accept it if the gradient is meant to be that one's",
         ("refined=COST", *EXPECTED),

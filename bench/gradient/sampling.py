@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,52 +24,66 @@ def repeats(first: np.ndarray, second: np.ndarray, unit: float) -> np.ndarray:
     return (first == second) | (np.isnan(first) & np.isnan(second)) | is_close
 
 
+@dataclass(frozen=True)
+class Lines:
+    """M lines through points along vectors, and the program's derivatives along them; a number holds for every line."""
+
+    theta: np.ndarray
+    """The points ``(d, M)``, or one ``(d,)`` for every line."""
+    vectors: np.ndarray
+    """The displacement by 1 along each line, ``(d, M)``."""
+    derivatives: np.ndarray
+    lengths: np.ndarray | float = 1.0
+    """The lengths of the vectors, in the unit by which the derivatives are taken."""
+    doubts: np.ndarray | float = 0.0
+    """The rounding errors of the derivatives."""
+    moved: np.ndarray | float = 0.0
+    """The changes of the derivatives where theta changes in its last digits."""
+
+
 def sampled(
     cost: Function,
-    theta: np.ndarray,
-    vectors: np.ndarray,
-    lengths: np.ndarray,
-    derivatives: np.ndarray,
+    lines: Lines,
     unit: float,
     eps: np.ndarray = EPS,
     modes: Modes | None = None,
     twice: bool = False,
-    doubts: np.ndarray | None = None,
-    moved: np.ndarray | None = None,
 ) -> tuple[list[Sample], np.ndarray, np.ndarray]:
-    """Return a sample per column of ``vectors (d, M)``, and the contact modes on the minus and plus sides, ``(M, K)`` each.
+    """Return a sample per line, and the contact modes on the minus and plus sides, ``(M, K)`` each.
 
-    ``theta`` is ``(d,)``, or ``(d, M)`` for directions that start at different points. Each is displaced along its
-    vector by the steps ``eps`` to both sides, by 0, and by the offsets of the noise estimate.
-    A displacement of 1 along direction m has the length ``lengths[m]``, in the unit by which ``derivatives[m]`` is
-    taken. With ``twice``, costs are computed again in reverse order, which exposes columns that depend on their neighbours.
+    Each point is displaced along its vector by the steps ``eps`` to both sides, by 0, and by the offsets of the noise estimate.
+    With ``twice``, costs are computed again in reverse order, which exposes columns that depend on their neighbours.
     """
-    count, start = eps.size, theta.reshape(len(theta), -1, 1)
+    count, (size, n_lines) = eps.size, lines.vectors.shape
     moves = np.concatenate([-eps, eps, [0.0], offsets(unit).ravel()])
-    at = (start + vectors[:, :, None] * moves).reshape(len(theta), -1)
-    values = cost(at).reshape(lengths.size, -1)
+    at = (lines.theta.reshape(size, -1, 1) + lines.vectors[:, :, None] * moves).reshape(size, -1)
+    values = cost(at).reshape(n_lines, -1)
     again = cost(at[:, ::-1])[::-1].reshape(values.shape) if twice else values
     repeatable = np.all(repeats(values, again, unit), axis=1)
-    sides = at.reshape(len(at), lengths.size, -1)[:, :, : 2 * count].reshape(len(at), -1)
-    names = np.array([""] * sides.shape[1] if modes is None else modes(sides), dtype=object).reshape(lengths.size, -1)
-    minus_modes, plus_modes = names[:, :count], names[:, count:]
+    sides = at.reshape(size, n_lines, -1)[:, :, : 2 * count].reshape(size, -1)
+    names = np.array([""] * sides.shape[1] if modes is None else modes(sides), dtype=object).reshape(n_lines, -1)
+    minus_modes, plus_modes = np.split(names, 2, axis=1)
+    numbers = np.broadcast_arrays(lines.derivatives, lines.lengths, lines.doubts, lines.moved)
     result = []
-    for m, row in enumerate(values):
+    for row, crossing, is_repeatable, *each in zip(
+        values, minus_modes != plus_modes, repeatable, *numbers, strict=True
+    ):
+        derivative, length, doubt, moved = map(float, each)
         with np.errstate(over="ignore", invalid="ignore"):
             measured = noise(row[2 * count + 1 :].reshape(2, POINTS))
             sample = Sample(
-                eps * lengths[m],
-                row[:count],
-                float(row[2 * count]),
-                row[count : 2 * count],
-                float(derivatives[m]),
-                minus_modes[m] != plus_modes[m],
-                bool(repeatable[m]),
-                float(lengths[m]),
-                unit,
-                measured,
-                0.0 if doubts is None else float(doubts[m]),
-                0.0 if moved is None else float(moved[m]),
+                step=eps * length,
+                minus=row[:count],
+                centre=float(row[2 * count]),
+                plus=row[count : 2 * count],
+                derivative=derivative,
+                crossing=crossing,
+                repeatable=bool(is_repeatable),
+                scale=length,
+                unit=unit,
+                noise=measured,
+                doubt=doubt,
+                moved=moved,
             )
             result.append(replace(sample, noise=max(measured, scatter(sample.step, sample.differences))))
     return result, minus_modes, plus_modes

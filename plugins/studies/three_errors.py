@@ -18,7 +18,7 @@ from bench.experiment.columns import COMMON, Column, Columns, exact, numbers, te
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Style, Table, Views
-from bench.gradient import sampled
+from bench.gradient import Lines, sampled
 from bench.model import Problem, Program
 from bench.report.style import PALETTE
 
@@ -161,10 +161,7 @@ def difference_check(problem: Problem) -> tuple[float, np.ndarray, np.ndarray, f
     gradient = problem.grad()
     samples, *_ = sampled(
         lambda at: problem.value(at, np.zeros((n_noise, at.shape[1]))),
-        theta,
-        np.eye(theta.size),
-        np.ones(theta.size),
-        gradient,
+        Lines(theta, np.eye(theta.size), gradient),
         float(np.finfo(np.float64).eps),
         STEPS,
     )

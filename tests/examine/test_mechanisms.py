@@ -13,7 +13,7 @@ import simulators
 import bench
 from bench.errors import UserError
 from bench.examine import lines
-from bench.examine.facts import GroupSize
+from bench.examine.judged import GroupSize
 from bench.examine.steps import changing_loop
 from bench.examine.subspace import groups_of
 from bench.report.text import number

@@ -357,10 +357,12 @@ def examine(
     slopes = [direction @ gradient for direction, gradient in zip(along.T, problem.grad(thetas, noises).T, strict=True)]
     samples, minus, plus = gradcheck.sampled(
         _cost(problem, d),
-        np.concatenate([thetas, noises]),
-        np.concatenate([scale * along, 0.0 * noises]),
-        np.full(len(places), scale),
-        np.array(slopes),
+        gradcheck.Lines(
+            np.concatenate([thetas, noises]),
+            np.concatenate([scale * along, 0.0 * noises]),
+            np.array(slopes),
+            scale,
+        ),
         unit,
         modes=None if modes is None else lambda at: modes(at[:d], at[d:]),
         twice=True,
