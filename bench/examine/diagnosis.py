@@ -238,15 +238,15 @@ def is_adaptive(stages: GradientStages, lines: Sequence[LineScan], effort: tuple
     if not 0.0 < size < np.inf:
         return False
     count, slope = _breaks_of_steps(lines, stages.scale)
-    if count >= FEWEST_BREAKS and size <= EXPLAINED * slope:
+    if size <= EXPLAINED * slope:
         return True
     direction, noise = error / size, max(stages.check.noise, stages.repeats.spread)
     line = scan(partial(stages.costs_along, direction), direction, noise, LONG, effort, stages.simulator.unit)
     count, slope = _breaks_of_steps([*lines, line], stages.scale)
     wrong = [part.error for part in stages.check.components if part.verdict in SUSPICIOUS]
     is_small = max(relative_error(stages.check), *wrong) <= NEAR
-    if count < FEWEST_BREAKS:
-        return is_small
+    if is_small and count < FEWEST_BREAKS:
+        return True  # so few breaks do not bound what the others change
     return size <= (EXPLAINED_IF_SMALL if is_small else EXPLAINED) * slope
 
 

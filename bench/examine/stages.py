@@ -243,7 +243,7 @@ class GradientStages:
             return False
         after_theta, after_other = values[4::3], values[3::3]
         apart = STATE * abs(after_theta[-1] - after_other[-1])
-        return bool(max(np.ptp(after_theta), np.ptp(after_other)) <= apart)
+        return bool(max(np.ptp(after_theta), np.ptp(after_other)) <= apart and apart > 0.0)
 
     def _repeat_gradient(self, other: np.ndarray) -> None:
         """Compare the gradient with that of an equal call after one at ``other (d,)``, or in a batch with it."""
