@@ -273,9 +273,12 @@ class Facts(JudgedCheck):
     def may_be_explained(self) -> bool:
         """Whether adaptive steps may explain the error, and the budget ended before that was known."""
         explained = self.explained
-        is_unknown = explained.is_adaptive is None and (bool(explained.steps) or may_be_adaptive(self.check))
+        steps, is_small = bool(explained.steps), may_be_adaptive(self.check)
         unseen = {part.name for part in doubtful(self.check.parts, self.groups)} - {*explained.smooth_parts}
-        return explained.refined is None and not self._is_decided and (is_unknown or bool(explained.steps and unseen))
+        is_unknown = explained.is_adaptive is None and (steps or is_small)
+        # breaks that do not explain a large error rule out what the smooth part could still show
+        is_unknown |= steps and is_small and bool(unseen)
+        return explained.refined is None and not self._is_decided and is_unknown
 
     @property
     def grows(self) -> bool:

@@ -234,8 +234,8 @@ EXAMINATION = {
     "noisy": Rule(
         "open",
         "the cost draws noise of its own, which hides the slope",
-        "the spread of equal calls of the cost is above u^{stages.SMALL} of it and does not come from the call before, in {stages.CALLS_OF_STATE} calls, and nothing else is wrong; or the gradient has "
-        "noise too, and no difference is {facts.CONTRADICTED:g} errors, with those by noise, away from it",
+        "the spread of equal calls of the cost is above u^{stages.SMALL} of it, or a call in a check of a derivative does not repeat; it does not come from the call before, in {stages.CALLS_OF_STATE} calls; and nothing else is wrong or, where the gradient has "
+        "noise too or a derivative did not repeat, no difference is {facts.CONTRADICTED:g} errors, with those by noise, away from it",
         "fix the seed, or pass the noise as w and set noise=N",
         EXPECTED,
     ),
@@ -264,8 +264,8 @@ EXAMINATION = {
         "gradient and differences differ by as much as the discretisation does, as with adaptive steps: neither is "
         "exactly the derivative of the solution",
         "`missing_term` or `wrong_adjoint` where a loop's length depends on theta, and the error is at most {diagnosis.EXPLAINED:g} times "
-        "the slope of {diagnosis.FEWEST_BREAKS} or more jumps, over the length of a line, and kinks; or {diagnosis.EXPLAINED_IF_SMALL:g} times, or there are fewer "
-        "breaks, where it and that of each wrong component are at most {diagnosis.NEAR:.0%}; jumps above {diagnosis.MOST_OF_CHANGE:.0%} of the cost's change on their line are events and do not count. With `refined`: the gradient is at "
+        "the slope of jumps, over the length of a line, and kinks; or {diagnosis.EXPLAINED_IF_SMALL:g} times, or there are fewer than "
+        "{diagnosis.FEWEST_BREAKS} breaks, where it and that of each wrong component are at most {diagnosis.NEAR:.0%}; jumps above {diagnosis.MOST_OF_CHANGE:.0%} of the cost's change on their line are events and do not count. With `refined`: the gradient is at "
         "most {judged.AGREES:g} times as far from it as the differences at each theta, or {facts.AS_FAR:g} times beside such a loop. "
         "Of a rough cost: no slope over wide steps is known to {smooth_part.LIMIT:.0%}",
         "give the cost at a tighter tolerance; accept it if the gradient is meant to be that one's",
