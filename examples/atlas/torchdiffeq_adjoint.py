@@ -10,7 +10,7 @@ about = {
     "package": "torchdiffeq",
     "python": "torch",
     "requires": "torch==2.13.0 torchdiffeq",
-    "examine": "grad=gradient calls=150",
+    "examine": "grad=gradient calls=400",
     "derivative": "wrong",
     "how": "SciPy's DOP853 at 1e-12",
     "advice": "`odeint_adjoint` solves backward in time; where this is unstable, tolerances of 1e-11 or `odeint` give the right gradient.",
