@@ -29,16 +29,10 @@ from bench.run.execute import store_of
 from bench.run.plan import requested_rows
 from bench.run.tasks import blank_row
 
-TINY = [
-    "scenes=[heaviside]",
-    "backends=[numpy]",
-    "estimators=[fobg,reinforce]",
-    "samples=8",
-    "repeats=4",
-    "name=tiny",
-    "workers=0",
-]
-"""Words of a run of two cells, in this process."""
+CELLS = ["scenes=[heaviside]", "backends=[numpy]", "estimators=[fobg,reinforce]", "samples=8", "repeats=4", "name=tiny"]
+"""Words of a run of two cells."""
+TINY = [*CELLS, "workers=0"]
+"""Words of such a run in this process."""
 NAMES = ("alpha_order", "finite_difference", "fobg", "inverse_variance", "randomized_smoothing", "reinforce")
 STIFFNESS = (1e1, 1e2, 1e3, 3e3, 1e4, 1e5, 1e6)
 BACKENDS = ("jax", "torch", "numpy", "implicit")

@@ -9,17 +9,9 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from helpers import CELLS
 
 ROOT = Path(__file__).resolve().parents[1]
-TINY = [
-    "scenes=[heaviside]",
-    "backends=[numpy]",
-    "estimators=[fobg,reinforce]",
-    "samples=8",
-    "repeats=4",
-    "name=tiny",
-    "--quiet",
-]
 HIDDEN = ("jax", "jaxlib", "torch", "optimistix", "lineax", "equinox", "mujoco", "numba")
 """Libraries of the extras, which the core does without."""
 
@@ -87,4 +79,4 @@ def test_installed_wheel_works_in_an_empty_folder_with_numpy_only(wheel, tmp_pat
 def test_a_directory_with_packages_of_the_same_names(hidden, tmp_path):
     (tmp_path / hidden).mkdir()
     (tmp_path / hidden / "__init__.py").write_text("raise RuntimeError('the wrong one')\n")
-    command(sys.executable, "-m", "bench", *TINY, cwd=tmp_path)
+    command(sys.executable, "-m", "bench", *CELLS, "--quiet", cwd=tmp_path)

@@ -26,7 +26,7 @@ EXPLAINED, EXPLAINED_IF_SMALL = 25.0, 100.0
 jumps over its length, and its kinks' changes of slope. Of right gradients it reaches 22, since only six breaks of a line are known,
 and more where a solver's error is smooth: then it is small."""
 FEWEST_BREAKS = 3
-"""Fewest breaks on all lines that bound an error."""
+"""Fewest breaks on all lines that bound a small error."""
 MOST_OF_CHANGE = 0.1
 """Largest height of a jump, as a share of the cost's change along its line, that adaptive steps make: a larger one is an event."""
 SPREADS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8, 0.8)
@@ -237,8 +237,7 @@ def is_adaptive(stages: GradientStages, lines: Sequence[LineScan], effort: tuple
     size = float(np.linalg.norm(error / stages.scale))
     if not 0.0 < size < np.inf:
         return False
-    count, slope = _breaks_of_steps(lines, stages.scale)
-    if size <= EXPLAINED * slope:
+    if size <= EXPLAINED * _breaks_of_steps(lines, stages.scale)[1]:
         return True
     direction, noise = error / size, max(stages.check.noise, stages.repeats.spread)
     line = scan(partial(stages.costs_along, direction), direction, noise, LONG, effort, stages.simulator.unit)

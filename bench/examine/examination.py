@@ -128,8 +128,8 @@ def examine(
         noise, (cost, grad, refined) = WORDS_OF_A_KEY, map(_with_key, (cost, grad, refined))
     if not isinstance(noise, int | np.integer) or noise < 0:
         raise UserError(f"noise={noise} is not the length of w in cost(theta, w): give a whole number, or {KEY}")
-    if not all(steps > 0 and steps == int(steps) for steps in horizons):
-        raise UserError(f"horizons={list(horizons)} are not numbers of steps: give whole numbers above 0")
+    if not all(steps > 0 and float(steps).is_integer() for steps in horizons):
+        raise UserError(f"horizons={','.join(map(str, horizons))} are not numbers of steps: give whole numbers above 0")
     layout = ParameterTree(theta)
     with np.errstate(over="ignore"):
         scales = layout.scales()

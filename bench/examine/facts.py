@@ -158,14 +158,14 @@ class Facts(JudgedCheck):
     @property
     def is_noisy(self) -> bool:
         """Whether equal calls of the cost differ by more than a floor, and not because of the call before."""
-        is_noisy = any(part.verdict == "nondeterministic" for part in self.settled.parts)
-        return (is_noisy or self.repeats.spread > self.repeats.floor) and not self.repeats.has_state
+        is_unrepeated = any(part.verdict == "nondeterministic" for part in self.settled.parts)
+        return (is_unrepeated or self.repeats.spread > self.repeats.floor) and not self.repeats.has_state
 
     @property
     def exceeds_noise(self) -> bool:
         """Whether the gradient of a noisy cost is wrong; one with noise of its own by more than all noise makes."""
-        is_noisy = self.repeats.of_gradient > self.repeats.floor_of_gradient
-        if is_noisy or self.settled.cause == "nondeterministic":
+        has_noise = self.repeats.of_gradient > self.repeats.floor_of_gradient
+        if has_noise or self.settled.cause == "nondeterministic":
             return any(p.verdict in FAULTS and self._is_contradicted(p) for p in self.settled.components)
         return self.settled.cause in FAULTS
 

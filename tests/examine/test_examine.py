@@ -261,7 +261,7 @@ def test_batches_are_told_from_the_result():
         ({"budget": "soon"}, "is not a duration"),
         ({"noise": -1}, "whole number"),
         ({"calls": 2.5}, "is not a number of calls"),
-        ({"horizons": [3.5]}, "are not numbers of steps"),
+        ({"horizons": np.array([3.5, np.inf])}, "horizons=3.5,inf are not numbers of steps"),
         ({"horizons": [0, 4]}, "are not numbers of steps"),
         ({"sigma": np.float32(-0.5)}, "above 0"),
         ({"sigma": [[0.1, 0.2], 0.3]}, "a list of numbers"),
